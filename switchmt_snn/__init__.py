@@ -1,0 +1,36 @@
+"""switchmt-snn: multi-task spiking Q-networks with adaptive task switching.
+
+from switchmt_snn import train, evaluate, load_agent
+
+result = train("minatar", run="runs/mine")
+print(evaluate(result.path, episodes=10).score("breakout").mean)
+action = load_agent(result.path).act(observation, task="breakout")
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from switchmt_snn.config import ExperimentConfig
+    from switchmt_snn.config_io import load_config
+    from switchmt_snn.learning.run import evaluate, load_agent, train
+
+__version__ = "0.1.0"
+__all__ = ["ExperimentConfig", "__version__", "evaluate", "load_agent", "load_config", "train"]
+
+_HOMES = {
+    "ExperimentConfig": "switchmt_snn.config",
+    "load_config": "switchmt_snn.config_io",
+    "evaluate": "switchmt_snn.learning.run",
+    "load_agent": "switchmt_snn.learning.run",
+    "train": "switchmt_snn.learning.run",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load the library's names when they are first used: ``import switchmt_snn`` stays free of torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'switchmt_snn' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,285 @@
+"""The command line: parse, call, print. No logic."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from switchmt_snn import __version__, config_io
+from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
+
+USAGE = """\
+usage: switchmt-snn COMMAND [options]
+
+  train [CONFIG]      train, or continue a run (CONFIG: a YAML file or a preset; default: quickstart)
+  evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
+  describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
+  doctor              versions, games and devices of this installation
+
+  switchmt-snn COMMAND --help shows a command's options; --version the version.
+  Exit codes: 0 done, 1 the run failed, 2 wrong use, 130 stopped by Ctrl-C (the same command with --run continues).
+"""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train one network on several tasks, or continue a run; every setting of the config is an option."""
+
+    experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
+    run: Path | None = None
+    """Run folder: continued if it holds a run of the same config, otherwise made. Default: a new one in runs/."""
+    print_config: bool = False
+    """Print the resolved config as YAML and stop."""
+    json: bool = False
+    """Print the result as JSON (progress goes to stderr)."""
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Play a run's agent and the random policy; settings that are not given are the run's own."""
+
+    episodes: int | None = None
+    """Episodes per task."""
+    epsilon: float | None = None
+    """Share of random actions."""
+    seed: int | None = None
+    """Seed of environments and random actions."""
+    num_envs: int | None = None
+    """Episodes played side by side."""
+    task: str | None = None
+    """Only this task."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Which weights."""
+    json: bool = False
+    """Print the scores as JSON."""
+
+
+@dataclass(frozen=True)
+class DescribeOptions:
+    """Describe what a config would build; every setting of the config is an option."""
+
+    experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
+    json: bool = False
+    """Print everything as JSON."""
+
+
+@dataclass(frozen=True)
+class DoctorOptions:
+    """Check this installation."""
+
+    json: bool = False
+    """Print the facts as JSON."""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of ``switchmt-snn``; exits with the code of USAGE."""
+    sys.exit(_main(sys.argv[1:] if argv is None else argv))
+
+
+def _main(argv: list[str]) -> int:
+    commands: dict[str, Callable[[list[str]], int]] = {
+        "train": _train,
+        "evaluate": _evaluate,
+        "describe": _describe,
+        "doctor": _doctor,
+    }
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(USAGE, end="")
+        return 0 if argv else 2
+    if argv[0] == "--version":
+        print(f"switchmt-snn {__version__}")
+        return 0
+    try:
+        if argv[0] not in commands:
+            raise ConfigError(f"unknown command {argv[0]!r}{did_you_mean(argv[0], commands)}")
+        return commands[argv[0]](argv[1:])
+    except SwitchMTError as error:
+        print(f"switchmt-snn: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("switchmt-snn: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+
+
+def _train(argv: list[str]) -> int:
+    source, rest = _leading_name(argv)
+    run = _peek(rest, "--run")
+    default = _starting_config(source, run)
+    options = _parse(TrainOptions, rest, "train", TrainOptions(experiment=default))
+    config = resolve(options.experiment)
+    if options.print_config:
+        print(config_io.to_yaml(config), end="")
+        return 0
+    from switchmt_snn.learning.run import Observer, train
+    from switchmt_snn.viewing.progress import Progress
+    from switchmt_snn.viewing.tables import evaluation_table
+    from switchmt_snn.viewing.tensorboard import TensorBoard
+
+    console = Console(stderr=options.json)
+    observers: list[Observer] = [Progress(console)]
+    if config.recording.tensorboard:
+        observers.append(TensorBoard())
+    result = train(config, options.run, observers)
+    if options.json:
+        scores = None if result.evaluation is None else result.evaluation.to_dict()
+        print(json.dumps({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores}))
+    again = f"switchmt-snn train --run {result.path}"
+    if result.status == "stopped":
+        console.print(f"stopped at step {result.step:,}; continue exactly here with: {again}", soft_wrap=True)
+    elif result.status == "already_finished":
+        console.print(
+            f"already finished at step {result.step:,}; raise the budget to go on: {again} --total-steps "
+            f"{2 * config.total_steps}",
+            soft_wrap=True,
+        )
+    elif result.evaluation is not None:
+        console.print(evaluation_table(result.evaluation))
+        _say_what_next(console, config, result.path)
+    if not options.json:
+        print(result.path)
+    return 130 if result.status == "stopped" else 0
+
+
+def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> None:
+    lines = []
+    if config.name == "quickstart":
+        lines.append(
+            "This run shows the machinery; it is far too short to learn Atari. What learns: 'switchmt-snn train "
+            "minatar' on a CPU (times and scores in results/minatar/README.md), 'switchmt-snn train paper' on a GPU."
+        )
+    lines += [
+        "Next:",
+        f"  switchmt-snn evaluate {path} --episodes 30",
+        f"  switchmt-snn train --run {path} --total-steps {2 * config.total_steps}",
+        "  switchmt-snn describe",
+    ]
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:
+    """The config that flags are laid over: the file named, else the run's own, else quickstart."""
+    if source is None and run is not None:
+        from switchmt_snn.learning.run_folder import RunFolder
+
+        folder = RunFolder(Path(run))
+        if folder.is_run:
+            return folder.config()
+    return config_io.load_config(source or "quickstart")
+
+
+def _evaluate(argv: list[str]) -> int:
+    run, rest = _leading_name(argv)
+    options = _parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
+    from switchmt_snn.learning.run import evaluate
+    from switchmt_snn.learning.run_folder import latest_run
+    from switchmt_snn.viewing.tables import evaluation_table
+
+    path = Path(run) if run is not None else latest_run()
+    names = ("episodes", "epsilon", "seed", "num_envs")
+    protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    evaluation = evaluate(path, options.task, options.checkpoint, **protocol)
+    if options.json:
+        print(json.dumps({"run": str(path), **evaluation.to_dict()}))
+    else:
+        Console().print(evaluation_table(evaluation))
+        print(path / "evaluations")
+    return 0
+
+
+def _describe(argv: list[str]) -> int:
+    source, rest = _leading_name(argv)
+    # The paper's settings give the paper's table; a config of one's own gives its own.
+    default = config_io.load_config(source or "paper")
+    options = _parse(DescribeOptions, rest, "describe", DescribeOptions(experiment=default))
+    from switchmt_snn.learning.description import describe
+    from switchmt_snn.learning.memory import available_bytes
+    from switchmt_snn.viewing.tables import layers_table, methods_table
+
+    config = resolve(options.experiment)
+    methods = describe(config)
+    if options.json:
+        facts: dict[str, Any] = {"config": config.name, "available_memory_bytes": available_bytes()}
+        print(json.dumps({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}}))
+        return 0
+    console = Console()
+    console.print(methods_table(methods))
+    console.print(layers_table(methods[config.network.method]))
+    return 0
+
+
+def _doctor(argv: list[str]) -> int:
+    options = _parse(DoctorOptions, argv, "doctor", DoctorOptions())
+    import torch
+    from ale_py import roms
+
+    from switchmt_snn.learning.memory import GIB, available_bytes
+    from switchmt_snn.learning.run import select_device
+    from switchmt_snn.learning.run_folder import describe_environment
+
+    device = select_device("auto")
+    facts = describe_environment(config_io.load_config("quickstart"), device)
+    facts = {key: facts[key] for key in ("versions", "python", "platform", "processor", "cores", "device")}
+    facts |= {
+        "torch_threads": torch.get_num_threads(),
+        "atari_games": len(roms.get_all_rom_ids()),
+        "available_memory_gib": round(available_bytes() / GIB, 1),
+    }
+    if options.json:
+        print(json.dumps(facts))
+        return 0
+    for key, value in facts.items():
+        shown = ", ".join(f"{k} {v or 'not installed'}" for k, v in value.items()) if isinstance(value, dict) else value
+        print(f"{key}: {shown}")
+    return 0
+
+
+def _leading_name(argv: list[str]) -> tuple[str | None, list[str]]:
+    """The positional argument, which comes first if it is there."""
+    return (argv[0], argv[1:]) if argv and not argv[0].startswith("-") else (None, argv)
+
+
+def _peek(argv: list[str], flag: str) -> str | None:
+    """The value of a flag before everything is parsed: it decides what the other flags are laid over."""
+    for index, word in enumerate(argv):
+        if word == flag and index + 1 < len(argv):
+            return argv[index + 1]
+        if word.startswith(f"{flag}="):
+            return word.split("=", 1)[1]
+    return None
+
+
+def _parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
+    """Parse flags over a default; tyro's boxed complaints become one line."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, default=default, args=argv, prog=f"switchmt-snn {command}")
+    except SystemExit as stop:
+        if stop.code == 0:
+            raise
+        raise ConfigError(_one_line(complaint.getvalue(), command)) from None
+
+
+def _one_line(boxed: str, command: str) -> str:
+    lines = [line.strip("│ ").strip() for line in boxed.splitlines() if line.startswith("│")]
+    text = " ".join(line for line in lines if line and not set(line) <= {"─"})
+    text = text.split("For full helptext")[0].split("Argument helptext")[0].strip().rstrip(".")
+    return f"{text}; see switchmt-snn {command} --help"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""A trained network ready to act: observations in, actions out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.errors import TaskError
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.tasks.suite import TaskSuite
+
+
+class Agent:
+    """The Q-network of a run together with the tasks that it was trained on.
+
+    Attributes:
+        network: in eval mode.
+        suite: names, action names and observation shape of its tasks.
+        config: the run's config.
+        step: training step of the weights.
+    """
+
+    def __init__(
+        self, network: QNetwork, suite: TaskSuite, config: ExperimentConfig, device: torch.device, step: int
+    ) -> None:
+        self.network = network.to(device).eval()
+        self.suite = suite
+        self.config = config
+        self.device = device
+        self.step = step
+        self._generator = torch.Generator(device).manual_seed(config.seed)
+        self._invalid_KA = torch.as_tensor(~suite.valid_actions_KA, device=device)
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers of the ``rate`` encoding, the only randomness of a greedy decision."""
+        self._generator.manual_seed(seed)
+
+    def q_values(self, observation: npt.NDArray[Any], task: str | int) -> npt.NDArray[np.float32]:
+        """Q-values ``[A]`` of one stacked observation, or ``[B, A]`` of a batch; -inf where an action does not exist.
+
+        Args:
+            observation: raw, ``suite.observation_shape`` (Atari: uint8 ``[4, 84, 84]``, oldest frame first) or a batch.
+            task: name or index.
+
+        Raises:
+            TaskError: unknown task, or an observation of another shape.
+        """
+        index = self.suite.index(task) if isinstance(task, str) else task
+        expected = self.suite.observation_shape
+        batch = observation[None] if observation.shape == expected else observation
+        if batch.shape[1:] != expected:
+            raise TaskError(
+                f"the observation has shape {observation.shape}, expected {expected} or (batch, "
+                f"{', '.join(map(str, expected))}): stacked frames, channels first, raw values"
+            )
+        self.network.eval()
+        with torch.inference_mode():
+            q_BA = self.network(
+                torch.from_numpy(np.ascontiguousarray(batch)).to(self.device), index, generator=self._generator
+            )
+            q_BA = q_BA.masked_fill(self._invalid_KA[index], -torch.inf)
+        values: npt.NDArray[np.float32] = q_BA.cpu().numpy()
+        return values[0] if observation.shape == expected else values
+
+    def act(self, observation: npt.NDArray[Any], task: str | int) -> Any:
+        """The greedy action (an int) for one observation, or actions ``[B]`` for a batch; see :meth:`q_values`."""
+        action = self.q_values(observation, task).argmax(axis=-1)
+        return int(action) if np.ndim(action) == 0 else action

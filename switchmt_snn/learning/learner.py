@@ -1,0 +1,156 @@
+"""The learner: double-DQN target, loss, Adam, target network (paper, Eq. 2; Algorithm 1, lines 10-12 and 21-22).
+
+Shapes: B batch, A actions, K tasks.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from switchmt_snn.config import LearningConfig
+from switchmt_snn.learning.replay import Batch
+from switchmt_snn.learning.state import Stateful
+from switchmt_snn.spiking.network import QNetwork
+
+
+def td_target(
+    rewards_B: Tensor, terminated_B: Tensor, q_next_BA: Tensor, q_choice_BA: Tensor, discount: float
+) -> Tensor:
+    """Eq. 2: ``y_n = r_n`` if the next state is terminal, else ``r_n + gamma Q*(s', argmax_a Q(s', a))``.
+
+    Args:
+        rewards_B: rewards r_n.
+        terminated_B: whether the next state is terminal. A truncated episode's next state is not.
+        q_next_BA: target network's values Q* of the next states.
+        q_choice_BA: values that choose the action; -inf where an action does not exist.
+        discount: gamma.
+    """
+    action_B1 = q_choice_BA.argmax(dim=1, keepdim=True)
+    value_B = q_next_BA.gather(1, action_B1).squeeze(1)
+    return rewards_B + discount * torch.where(terminated_B, torch.zeros_like(value_B), value_B)
+
+
+class Learner(Stateful):
+    """Owns the online network Q, the target network Q* and the optimiser.
+
+    Q(s, a) is computed in training mode (batch statistics); the target and the choice of its action in eval mode, with
+    the running statistics of the batch's task.
+
+    Attributes:
+        updates: gradient steps made.
+    """
+
+    SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
+    DERIVED = ("config", "device", "_invalid_KA")
+
+    def __init__(
+        self,
+        network: QNetwork,
+        config: LearningConfig,
+        valid_actions_KA: npt.NDArray[np.bool_],
+        device: torch.device,
+        seed: int,
+    ) -> None:
+        self.config = config
+        self.device = device
+        self.network = network.to(device)
+        self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.updates = 0
+        self._invalid_KA = torch.as_tensor(~valid_actions_KA, device=device)
+        self.loss_sum = torch.zeros((), device=device)
+        self.q_sum = torch.zeros((), device=device)
+        self.summed = 0
+
+    def act(self, observations: npt.NDArray[np.generic], task: int) -> npt.NDArray[np.int64]:
+        """Greedy actions ``[B]`` for raw stacked observations ``[B, ...]`` of a task (eval mode)."""
+        self.network.eval()
+        with torch.inference_mode():
+            q_BA = self.network(self._tensor(observations), task, generator=self.generator)
+            q_BA = q_BA.masked_fill(self._invalid_KA[task], -torch.inf)
+            return q_BA.argmax(dim=1).cpu().numpy()  # type: ignore[no-any-return]
+
+    def update(self, batch: Batch, task: int) -> None:
+        """One gradient step on a batch of one task."""
+        config = self.config
+        observations, next_observations = self._tensor(batch.observations), self._tensor(batch.next_observations)
+        rewards_B = self._tensor(batch.rewards)
+        if config.clip_rewards:
+            rewards_B = rewards_B.clamp(-1.0, 1.0)
+        with torch.no_grad():
+            q_next_BA = self.target(next_observations, task, generator=self.generator)
+            q_choice_BA = q_next_BA
+            if config.double_q:
+                self.network.eval()
+                q_choice_BA = self.network(next_observations, task, generator=self.generator)
+            q_choice_BA = q_choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
+            target_B = td_target(rewards_B, self._tensor(batch.terminated), q_next_BA, q_choice_BA, config.discount)
+        self.network.train()
+        q_BA = self.network(observations, task, generator=self.generator)
+        q_B = q_BA.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
+        loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if config.gradient_clip == "value":
+            torch.nn.utils.clip_grad_value_(self.network.parameters(), config.gradient_clip_at)
+        elif config.gradient_clip == "norm":
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip_at)
+        self.optimizer.step()
+        self.updates += 1
+        self.loss_sum += loss.detach()
+        self.q_sum += q_B.detach().mean()
+        self.summed += 1
+
+    def copy_target(self) -> None:
+        """Q* <- Q, running statistics included."""
+        self.target.load_state_dict(self.network.state_dict())
+
+    def parameters(self) -> Tensor:
+        """theta as one vector: a copy, never a view of the live parameters (ALGORITHM section 4)."""
+        return torch.cat([parameter.detach().reshape(-1) for parameter in self.network.parameters()])
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put a saved state back; JSON made the optimiser's parameter numbers text."""
+        optimizer = state["optimizer"]
+        numbered = {int(number): values for number, values in optimizer["state"].items()}
+        super().load_state_dict({**state, "optimizer": {**optimizer, "state": numbered}})
+
+    def take_means(self) -> dict[str, float]:
+        """Mean loss and mean Q(s, a) of the updates since the last call; empty if there were none."""
+        if self.summed == 0:
+            return {}
+        means = {"loss": float(self.loss_sum) / self.summed, "q": float(self.q_sum) / self.summed}
+        self.loss_sum.zero_()
+        self.q_sum.zero_()
+        self.summed = 0
+        return means
+
+    def is_finite(self) -> bool:
+        """Whether every loss since :meth:`take_means` and every parameter is finite."""
+        finite = torch.isfinite(self.loss_sum)
+        for parameter in self.network.parameters():
+            finite = finite & torch.isfinite(parameter).all()
+        return bool(finite)
+
+    def firing_rates(self, observations: npt.NDArray[np.generic], task: int) -> dict[str, Tensor]:
+        """Mean activity of every neuron over T and batch, by layer ``[neurons]`` (spikes per step, or ReLU output).
+
+        Draws its own random numbers, so looking does not change training.
+        """
+        activity: dict[str, Tensor] = {}
+        self.network.eval()
+        with torch.inference_mode():
+            generator = torch.Generator(self.device).manual_seed(0)
+            self.network(self._tensor(observations), task, activity=activity, generator=generator)
+        return {name: spikes.mean(dim=(0, 1)).flatten() for name, spikes in activity.items()}
+
+    def _tensor(self, array: npt.NDArray[np.generic]) -> Tensor:
+        return torch.from_numpy(array).to(self.device)

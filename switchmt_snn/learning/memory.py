@@ -1,0 +1,95 @@
+"""Memory of a run before it starts: what it will need, what there is."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.spiking.network import QNetwork, trainable_parameters
+from switchmt_snn.tasks.suite import TaskSuite
+
+GIB = 1024**3
+PROCESS_BYTES = 700 * 1024**2
+"""Python, torch and the emulators before a network exists (measured: 0.4 to 0.7 GiB)."""
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Bytes by part; ``total_bytes`` adds the process itself."""
+
+    replay_bytes: int
+    network_bytes: int
+    switching_bytes: int
+    activations_bytes: int
+
+    @property
+    def total_bytes(self) -> int:
+        """All parts and the process."""
+        parts = self.replay_bytes + self.network_bytes + self.switching_bytes + self.activations_bytes
+        return parts + PROCESS_BYTES
+
+
+def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwork, neurons: int) -> MemoryEstimate:
+    """Estimate a run's memory.
+
+    Args:
+        config: resolved.
+        suite: for the size of a frame.
+        network: for its parameters.
+        neurons: number of neurons of the network.
+    """
+    item = 1 if suite.in_unit_range else 4
+    slot_bytes = math.prod(suite.frame_shape) * item + 2 + 4 + 1 + 1 + 1  # frame, action, reward, three flags
+    parameters = trainable_parameters(network) * 4
+    snapshots = config.switching.window_episodes + 2 if config.switching.policy.startswith("parameter") else 0
+    # A training step keeps currents, membranes, spikes and the surrogate's terms of T steps: about 6 floats each
+    # (measured on the 84x84 network), the inputs as floats besides.
+    batch = config.learning.batch_size
+    steps = config.network.timesteps
+    activations = batch * 4 * (6 * neurons * steps + 4 * math.prod(suite.observation_shape))
+    return MemoryEstimate(
+        replay_bytes=slot_bytes * config.learning.replay_capacity_steps * len(suite.names),
+        network_bytes=5 * parameters,  # weights, gradients, two Adam moments, target network
+        switching_bytes=snapshots * parameters,
+        activations_bytes=activations,
+    )
+
+
+def available_bytes() -> int:
+    """Memory that this process may still take: the machine's, or less where a control group limits it."""
+    available = int(psutil.virtual_memory().available)
+    with contextlib.suppress(OSError, ValueError):
+        limit = int(Path("/sys/fs/cgroup/memory.max").read_text())
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+        available = min(available, limit - used)
+    return available
+
+
+def require_memory(estimate: MemoryEstimate, config: ExperimentConfig, available: int | None = None) -> None:
+    """Refuse a run that cannot fit.
+
+    Raises:
+        ConfigError: with the numbers and what to lower.
+    """
+    available = available_bytes() if available is None else available
+    if estimate.total_bytes <= available:
+        return
+    rest = estimate.total_bytes - estimate.replay_bytes
+    fitting = int((available - rest) / (estimate.replay_bytes / config.learning.replay_capacity_steps))
+    remedy = (
+        f"lower learning.replay_capacity_steps to at most {fitting:,}"
+        if fitting > config.learning.batch_size
+        else "lower learning.batch_size and learning.replay_capacity_steps"
+    )
+    raise ConfigError(
+        f"the run needs {estimate.total_bytes / GIB:.1f} GiB (replay {estimate.replay_bytes / GIB:.1f}, activations "
+        f"{estimate.activations_bytes / GIB:.1f}, networks and snapshots "
+        f"{(estimate.network_bytes + estimate.switching_bytes) / GIB:.1f}), expected at most the "
+        f"{available / GIB:.1f} GiB that are available; {remedy}"
+    )

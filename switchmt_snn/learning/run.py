@@ -1,0 +1,314 @@
+"""Driving a run: new or continued, checkpoints, evaluations, clean stops; for the command line and the library."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from switchmt_snn import config_io
+from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.errors import ConfigError, TrainingFailed
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.description import describe_method
+from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
+from switchmt_snn.learning.events import Event, Stepped
+from switchmt_snn.learning.memory import require_memory
+from switchmt_snn.learning.run_folder import (
+    RunFolder,
+    RunLogs,
+    check_same_config,
+    describe_environment,
+    latest_run,
+    new_run_path,
+)
+from switchmt_snn.learning.training import Training, observation_spec
+from switchmt_snn.spiking.network import build_network
+from switchmt_snn.tasks.suite import make_suite
+
+BEST_WINDOW_EPISODES = 20
+"""The best checkpoint has the largest mean rise of the newest 20 training returns over a task's first 20."""
+
+
+class Observer(Protocol):
+    """Watches a run; the loop never waits for it to agree."""
+
+    def start(self, training: Training, folder: RunFolder, resumed_at: int | None) -> None:
+        """The run begins or goes on."""
+
+    def __call__(self, event: Event) -> None:
+        """Something happened."""
+
+    def note(self, text: str) -> None:
+        """Something that the user should read."""
+
+    def stop(self) -> None:
+        """The loop is over."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a call of :func:`train` ended.
+
+    Attributes:
+        status: ``finished``, ``stopped`` (by a signal; the same command continues), or ``already_finished``.
+        evaluation: the final evaluation of a run that finished.
+    """
+
+    path: Path
+    status: str
+    step: int
+    evaluation: Evaluation | None
+
+
+def train(
+    config: ExperimentConfig | str | Path | None = None,
+    run: str | Path | None = None,
+    observers: Sequence[Observer] = (),
+) -> RunResult:
+    """Train, or continue a run.
+
+    Args:
+        config: a config, a YAML file, or a preset's name. None continues ``run`` with its stored config, or takes the
+            quickstart preset for a new run.
+        run: run folder. One that holds a run of the same config is continued; None makes a new one under ``runs/``.
+        observers: progress displays and the like.
+
+    Raises:
+        SwitchMTError: wrong use (``exit_code`` 2), or a run that failed (``exit_code`` 1).
+    """
+    if isinstance(config, (str, Path)):
+        config = config_io.load_config(config)
+    folder = RunFolder(Path(run) if run is not None else Path(new_run_path(_name_of(config))))
+    stored = folder.config() if folder.is_run else None
+    if config is None:
+        config = stored or config_io.load_config("quickstart")
+    config = resolve(config)
+    if stored is not None:
+        check_same_config(stored, config, folder.path)
+    suite = make_suite(config.tasks)
+    device = select_device(config.device)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    require_memory(describe_method(config, suite).memory, config)
+    lock = folder.lock()
+    try:
+        if stored is None:
+            folder.create(config, describe_environment(config, device))
+        elif stored != config:
+            folder.save_config(config)
+        training = Training(config, suite, device)
+        try:
+            return _Driver(folder, training, observers).run()
+        finally:
+            training.close()
+    finally:
+        lock.release()
+
+
+def _name_of(config: ExperimentConfig | None) -> str:
+    return config.name if config is not None else "quickstart"
+
+
+def select_device(wish: str) -> torch.device:
+    """The device for a wish.
+
+    Raises:
+        ConfigError: the wished device is not there.
+    """
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if wish == "auto":
+        return torch.device(next(name for name, present in there.items() if present))
+    if not there[wish]:
+        present = ", ".join(name for name, is_there in there.items() if is_there)
+        raise ConfigError(f"device is {wish!r}, expected one that this machine has ({present}); use device=auto")
+    return torch.device(wish)
+
+
+class _Driver:
+    """One call's worth of a run: feeds observers, saves, evaluates, stops."""
+
+    def __init__(self, folder: RunFolder, training: Training, observers: Sequence[Observer]) -> None:
+        self.folder, self.training, self.observers = folder, training, observers
+        self.config = training.config
+        self.store = folder.checkpoints(self.config.recording.keep_checkpoints)
+        self.logs: RunLogs | None = None
+
+    def run(self) -> RunResult:
+        training, config = self.training, self.config
+        log_sizes, resumed_at, notes = self._restore()
+        if resumed_at is not None and training.steps >= config.total_steps:
+            return RunResult(self.folder.path, "already_finished", training.steps, None)
+        try:
+            return self._run(log_sizes, resumed_at, notes)
+        except OSError as error:
+            raise TrainingFailed(
+                f"writing to {self.folder.path} failed at step {training.steps} ({error.strerror or error}), expected "
+                "a disk with room; the last whole checkpoint is kept: make room and run the same command with "
+                f"--run {self.folder.path}"
+            ) from error
+
+    def _run(self, log_sizes: dict[str, int] | None, resumed_at: int | None, notes: list[str]) -> RunResult:
+        training, path = self.training, self.folder.path
+        self.logs = logs = RunLogs(self.folder, training.suite.names, log_sizes)
+        for observer in self.observers:
+            observer.start(training, self.folder, resumed_at)
+        for text in notes:
+            self._note(text)
+        stopped = False
+        try:
+            with _stop_requests() as requested:
+                for event in training.events():
+                    logs(event)
+                    for observer in self.observers:
+                        observer(event)
+                    if isinstance(event, Stepped):
+                        self._record(event.step)
+                        if requested():
+                            stopped = training.steps < self.config.total_steps
+                            break
+                self._save()
+        finally:
+            logs.close()
+            for observer in self.observers:
+                observer.stop()
+        if stopped:
+            return RunResult(path, "stopped", training.steps, None)
+        return RunResult(path, "finished", training.steps, self._evaluate())
+
+    def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
+        """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""
+        if not self.store.paths():
+            return None, None, []
+        loaded = self.store.load(self.training.replays)
+        self.training.load_state_dict(loaded.state)
+        notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]
+        if not self.training.reproducible:
+            notes.append(
+                "the environment did not repeat its running episodes from seed and actions; the run goes on, but not "
+                "exactly as it would have without the interruption"
+            )
+        return loaded.log_sizes, loaded.step, notes
+
+    def _record(self, step: int) -> None:
+        """Save and evaluate when a border of their periods was crossed by the last vector step."""
+        before = step - self.training.num_envs
+        every = self.config.evaluation.every_steps
+        if every is not None and step // every > before // every and step < self.config.total_steps:
+            self._evaluate()
+        every = self.config.recording.checkpoint_every_steps
+        if step // every > before // every and step < self.config.total_steps:
+            self._save()
+
+    def _save(self) -> None:
+        assert self.logs is not None
+        training = self.training
+        training.check_finite()
+        self.store.save(training.steps, training.state_dict(), training.replays, self.logs.sync())
+        score = self._rise()
+        best = self.store.best_score()
+        if score is not None and (best is None or score > best):
+            self.store.save_best(training.steps, training.learner.network.state_dict(), score)
+
+    def _rise(self) -> float | None:
+        """Mean over tasks of (newest returns - first returns) / spread of the first; None while episodes are few."""
+        returns = self.folder.initial_and_recent_returns(BEST_WINDOW_EPISODES)
+        rises = []
+        for name in self.training.suite.names:
+            first, newest = returns.get(name, ([], []))
+            if len(first) < BEST_WINDOW_EPISODES:
+                return None
+            rises.append((np.mean(newest) - np.mean(first)) / max(1.0, float(np.std(first))))
+        return float(np.mean(rises))
+
+    def _evaluate(self) -> Evaluation:
+        training = self.training
+        agent = Agent(training.learner.network, training.suite, self.config, training.learner.device, training.steps)
+        protocol = EvaluationProtocol.of(self.config.evaluation, self.config.tasks)
+        self._note(f"evaluating: {protocol}")
+        evaluation = evaluate_agent(agent, protocol)
+        self.folder.save_evaluation(evaluation)
+        return evaluation
+
+    def _note(self, text: str) -> None:
+        for observer in self.observers:
+            observer.note(text)
+
+
+@contextmanager
+def _stop_requests() -> Iterator[Callable[[], bool]]:
+    """Within it, the first SIGINT or SIGTERM only asks to stop at the next whole step; a second SIGINT interrupts."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def load_agent(run: str | Path | None = None, checkpoint: str = "last", device: str = "auto") -> Agent:
+    """The trained agent of a run.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        checkpoint: ``last`` or ``best``.
+        device: as in the config.
+
+    Raises:
+        RunFolderError: no such run.
+        CheckpointError: no whole checkpoint.
+    """
+    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    config = folder.config()
+    suite = make_suite(config.tasks)
+    step, weights, _ = folder.checkpoints().load_model(checkpoint)
+    network = build_network(config.network, observation_spec(suite), config.seed)
+    network.load_state_dict(weights)
+    return Agent(network, suite, config, select_device(device), step)
+
+
+def evaluate(
+    run: str | Path | None = None,
+    task: str | None = None,
+    checkpoint: str = "last",
+    save: bool = True,
+    **protocol: Any,
+) -> Evaluation:
+    """Evaluate a run's agent and the random policy.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        task: one task's name; None evaluates all.
+        checkpoint: ``last`` or ``best``.
+        save: write JSON and CSV to the run's ``evaluations/``.
+        protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.
+
+    Raises:
+        SwitchMTError: no run, no checkpoint, no such task, or a protocol out of range.
+    """
+    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    agent = load_agent(folder.path, checkpoint)
+    settings = replace(agent.config.evaluation, **protocol)
+    tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
+    evaluation = evaluate_agent(agent, EvaluationProtocol.of(settings, agent.config.tasks), tasks)
+    if save:
+        folder.save_evaluation(evaluation)
+    return evaluation

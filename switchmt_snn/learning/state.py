@@ -1,0 +1,61 @@
+"""Saving and loading the state of the parts of a run.
+
+A stateful part names what it saves in ``SAVED`` and what it can rebuild (settings, caches, things handed in) in
+``DERIVED``; tests/test_state.py walks all parts and fails if an attribute is in neither.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+
+class Stateful:
+    """A part whose ``SAVED`` attributes make up its state.
+
+    An attribute may be a number, text, list or dict of such, an array or tensor, a random generator, or another part
+    with ``state_dict`` and ``load_state_dict``.
+    """
+
+    SAVED: ClassVar[tuple[str, ...]] = ()
+    DERIVED: ClassVar[tuple[str, ...]] = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The saved attributes, as nested dicts of plain values, arrays and tensors."""
+        return {name: _packed(getattr(self, name)) for name in self.SAVED}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put a saved state back; parts and generators are filled in place."""
+        for name in self.SAVED:
+            setattr(self, name, _unpacked(getattr(self, name), state[name]))
+
+
+def _packed(value: Any) -> Any:
+    if isinstance(value, np.random.Generator):
+        return value.bit_generator.state
+    if isinstance(value, torch.Generator):
+        return value.get_state()
+    if hasattr(value, "state_dict"):
+        return value.state_dict()
+    if isinstance(value, list) and value and hasattr(value[0], "state_dict"):
+        return {str(index): item.state_dict() for index, item in enumerate(value)}
+    return value.copy() if isinstance(value, (list, dict, np.ndarray)) else value
+
+
+def _unpacked(current: Any, saved: Any) -> Any:
+    if isinstance(current, np.random.Generator):
+        current.bit_generator.state = saved
+        return current
+    if isinstance(current, torch.Generator):
+        current.set_state(saved)
+        return current
+    if hasattr(current, "load_state_dict"):
+        current.load_state_dict(saved)
+        return current
+    if isinstance(current, list) and current and hasattr(current[0], "load_state_dict"):
+        for index, item in enumerate(current):
+            item.load_state_dict(saved[str(index)])
+        return current
+    return saved

@@ -1,0 +1,288 @@
+"""Algorithm 1 of the paper: one spiking Q-network learns several tasks and switches between them.
+
+The loop is a generator of events. It knows no screen and no file format; whoever drives it decides when to save
+(:class:`Training` is stateful, and whole whenever a :class:`Stepped` event is yielded) and when to stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.errors import TrainingFailed
+from switchmt_snn.learning.clocks import Every, linear_decay
+from switchmt_snn.learning.events import EpisodeEnded, Event, LayerHealth, Measured, Stepped, SwitchDecided
+from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.replay import FrameReplay
+from switchmt_snn.learning.state import Stateful
+from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
+from switchmt_snn.spiking.network import ObservationSpec, build_network
+from switchmt_snn.tasks.play import Play, PlayedStep, episode_seed
+from switchmt_snn.tasks.suite import TaskSuite
+
+HEALTH_BATCH = 32
+
+
+def observation_spec(suite: TaskSuite) -> ObservationSpec:
+    """What the network must know of a suite."""
+    return ObservationSpec(
+        shape=suite.observation_shape,
+        frame_stack=suite.frame_stack,
+        scale=suite.scale,
+        in_unit_range=suite.in_unit_range,
+        num_actions=suite.num_actions,
+        num_tasks=len(suite.names),
+    )
+
+
+class Training(Stateful):
+    """One run of Algorithm 1.
+
+    Attributes:
+        steps: agent steps made, over all tasks.
+        steps_by_task: agent steps made in each task.
+        task: index i of the current task.
+    """
+
+    SAVED = (
+        "learner",
+        "replays",
+        "policy",
+        "task",
+        "visit",
+        "steps",
+        "steps_by_task",
+        "steps_in_visit",
+        "episodes_in_visit",
+        "episodes_by_task",
+        "starts_by_task",
+        "explore_rng",
+        "sample_rng",
+        "update_clock",
+        "target_clock",
+        "metrics_clock",
+    )
+    DERIVED = ("config", "suite", "num_envs", "play", "reproducible", "_plays")
+
+    def __init__(self, config: ExperimentConfig, suite: TaskSuite, device: torch.device) -> None:
+        """Prepare a run from a resolved config; nothing is played yet."""
+        self.config, self.suite = config, suite
+        self.num_envs = config.tasks.num_envs
+        num_tasks = len(suite.names)
+        network_seed, explore_seed, sample_seed, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
+        network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
+        self.learner = Learner(
+            network, config.learning, suite.valid_actions_KA, device, int(encode_seed.generate_state(1)[0])
+        )
+        learning = config.learning
+        self.replays = [
+            FrameReplay(
+                learning.replay_capacity_steps, self.num_envs, suite.frame_shape, suite.frame_dtype, suite.frame_stack
+            )
+            for _ in suite.names
+        ]
+        self.policy = SwitchingPolicy(config.switching, num_tasks)
+        self.task = 0
+        self.visit = 0
+        self.steps = 0
+        self.steps_by_task = [0] * num_tasks
+        self.steps_in_visit = 0
+        self.episodes_in_visit = 0
+        self.episodes_by_task = [0] * num_tasks  # episodes that ended
+        self.starts_by_task = [0] * num_tasks  # episodes that began; numbers their seeds
+        self.explore_rng = np.random.default_rng(explore_seed)
+        self.sample_rng = np.random.default_rng(sample_seed)
+        self.update_clock = Every(learning.update_every_steps)
+        self.target_clock = Every(learning.target_update_every_steps)
+        self.metrics_clock = Every(config.recording.metrics_every_steps)
+        self.play: Play | None = None
+        self.reproducible = True
+        self._plays: dict[int, Play] = {}
+
+    def events(self) -> Iterator[Event]:
+        """Run until ``total_steps``; every event carries the step at which it happened.
+
+        Raises:
+            TrainingFailed: a loss or a parameter is no longer finite.
+        """
+        if self.play is None:
+            self._enter(self.task)
+        while self.steps < self.config.total_steps:
+            play = self._current_play()
+            task, epsilon = self.task, self.epsilon()
+            warming_up = self.is_warming_up(task)
+            actions = self.select_actions(play, 1.0 if warming_up else epsilon)  # a via epsilon-greedy
+            played = play.step(actions)  # observe r and s'
+            self._remember(play, actions, played)  # store in D_i
+            self._count_steps()
+            self._learn()  # sample from D_i, gradient step
+            yield from self._end_episodes(play, played, epsilon)  # terminal: H_i, Eq. 3, maybe i <- i + 1 mod |E|
+            for _ in range(self.target_clock.advance(self.num_envs)):
+                self.learner.copy_target()  # Q* <- Q
+            if self.metrics_clock.advance(self.num_envs):
+                yield self.measure()
+            yield Stepped(self.steps, task, epsilon, warming_up)
+
+    def epsilon(self) -> float:
+        """Exploration now: linear decay over the run's steps, or over those of the current task."""
+        learning = self.config.learning
+        step = self.steps if learning.epsilon_clock == "total" else self.steps_by_task[self.task]
+        return linear_decay(learning.epsilon_start, learning.epsilon_end, learning.epsilon_decay_steps, step)
+
+    def is_warming_up(self, task: int) -> bool:
+        """Whether a task's buffer is not sampled yet; its actions are random until then."""
+        return self.replays[task].transitions_added < self.config.learning.learning_starts_steps
+
+    def select_actions(self, play: Play, epsilon: float) -> npt.NDArray[np.int64]:
+        """Epsilon-greedy over the actions that exist in the task; the same random draws whatever the network says."""
+        valid = np.flatnonzero(self.suite.valid_actions_KA[self.task])
+        explore = self.explore_rng.random(self.num_envs) < epsilon
+        actions = valid[self.explore_rng.integers(0, len(valid), self.num_envs)]
+        if not explore.all():
+            greedy = self.learner.act(play.observations, self.task)
+            actions = np.where(explore, actions, greedy)
+        return actions
+
+    def _remember(self, play: Play, actions: npt.NDArray[np.int64], played: PlayedStep) -> None:
+        replay = self.replays[self.task]
+        for env in range(self.num_envs):
+            replay.add(
+                env, int(actions[env]), float(played.rewards[env]), bool(played.terminated[env]), played.frames[env]
+            )
+
+    def _count_steps(self) -> None:
+        self.steps += self.num_envs
+        self.steps_by_task[self.task] += self.num_envs
+        self.steps_in_visit += self.num_envs
+
+    def _learn(self) -> None:
+        """The updates that are due, from the current task's buffer or from every task's in turn."""
+        learning = self.config.learning
+        for _ in range(self.update_clock.advance(self.num_envs)):
+            tasks = [self.task] if learning.update_tasks == "current" else range(len(self.replays))
+            for task in tasks:
+                if not self.is_warming_up(task):
+                    self.learner.update(self.replays[task].sample(learning.batch_size, self.sample_rng), task)
+
+    def _end_episodes(self, play: Play, played: PlayedStep, epsilon: float) -> Iterator[Event]:
+        """Report ended episodes, ask the policy, and start what comes next (Algorithm 1, lines 13-20)."""
+        task = self.task
+        switch: SwitchTo | None = None
+        for env in played.ended:
+            self.episodes_by_task[task] += 1
+            self.episodes_in_visit += 1
+            episode_return = float(play.returns[env])
+            yield EpisodeEnded(
+                step=self.steps,
+                task=task,
+                episode=self.episodes_by_task[task],
+                episode_return=episode_return,
+                length_steps=int(play.lengths_steps[env]),
+                truncated=bool(played.truncated[env]) and not bool(played.terminated[env]),
+                epsilon=epsilon,
+                updates=self.learner.updates,
+            )
+            if switch is None:
+                record = EpisodeRecord(
+                    task=task,
+                    episodes_in_visit=self.episodes_in_visit,
+                    steps_in_visit=self.steps_in_visit,
+                    updates=self.learner.updates,
+                    episode_return=episode_return,
+                    parameters=self.learner.parameters,
+                )
+                decision = self.policy.end_of_episode(record)
+                yield self._decided(decision)
+                switch = decision if isinstance(decision, SwitchTo) else None
+        if switch is None and self.policy.must_leave(self.steps_in_visit):
+            switch = self.policy.leave(task)
+            yield self._decided(switch)
+        if switch is not None:
+            self._enter(switch.task)
+        elif len(played.ended):
+            self._begin_episodes(play, played.ended)
+
+    def _decided(self, decision: Stay | SwitchTo) -> SwitchDecided:
+        return SwitchDecided(self.steps, self.task, self.visit, self.episodes_in_visit, self.steps_in_visit, decision)
+
+    def _enter(self, task: int) -> None:
+        """Begin a visit; running episodes of the task that is left stay cut where they are."""
+        self.visit += 1
+        self.task = task
+        self.steps_in_visit = 0
+        self.episodes_in_visit = 0
+        self.play = self._make_play(task)
+        self._begin_episodes(self.play, np.arange(self.num_envs))
+
+    def _begin_episodes(self, play: Play, env_ids: npt.NDArray[np.int64]) -> None:
+        seeds = []
+        for _ in env_ids:
+            seeds.append(episode_seed(self.config.seed, self.task, self.starts_by_task[self.task]))
+            self.starts_by_task[self.task] += 1
+        frames = play.begin(env_ids, np.asarray(seeds, np.int64))
+        for env, frame in zip(env_ids, frames, strict=True):
+            self.replays[self.task].begin(int(env), frame)
+
+    def _make_play(self, task: int) -> Play:
+        """The environments of a task, made at its first visit and kept."""
+        if task not in self._plays:
+            self._plays[task] = Play(self.suite, task, self.num_envs)
+        return self._plays[task]
+
+    def _current_play(self) -> Play:
+        assert self.play is not None, "events() enters the first task before the first step"
+        return self.play
+
+    def measure(self) -> Measured:
+        """Means since the last report and the health of every neuron layer on the current task.
+
+        Raises:
+            TrainingFailed: a loss or a parameter is not finite.
+        """
+        self.check_finite()
+        means = self.learner.take_means()
+        layers: dict[str, LayerHealth] = {}
+        replay = self.replays[self.task]
+        if not self.is_warming_up(self.task):
+            newest = replay.valid_slots()[-HEALTH_BATCH:]
+            for name, rate in self.learner.firing_rates(replay.gather(newest).observations, self.task).items():
+                dead, saturated = float((rate == 0).float().mean()), float((rate >= 1).float().mean())
+                layers[name] = LayerHealth(float(rate.mean()), dead, saturated if self.learner.network.spiking else 0.0)
+        return Measured(
+            step=self.steps,
+            task=self.task,
+            updates=self.learner.updates,
+            loss=means.get("loss"),
+            q=means.get("q"),
+            steps_by_task=tuple(self.steps_by_task),
+            layers=layers,
+        )
+
+    def check_finite(self) -> None:
+        """Raise TrainingFailed if a loss or a parameter is not finite; a checkpoint never holds such a network."""
+        if not self.learner.is_finite():
+            raise TrainingFailed(
+                f"the loss is not finite after {self.learner.updates} updates (step {self.steps}), expected a number; "
+                "the last checkpoint is from before it; try a lower learning.learning_rate, learning.loss=huber or "
+                "learning.gradient_clip=norm"
+            )
+
+    def state_dict(self) -> dict[str, object]:
+        """The whole run, its running episodes included."""
+        return {**super().state_dict(), "play": None if self.play is None else self.play.state_dict()}
+
+    def load_state_dict(self, state: dict[str, object]) -> None:
+        """Continue a run; ``reproducible`` tells whether the running episodes came back as they were."""
+        super().load_state_dict(state)
+        if state["play"] is not None:
+            self.play = self._make_play(self.task)
+            self.reproducible = self.play.load_state_dict(state["play"])  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """Free the environments."""
+        for play in self._plays.values():
+            play.close()

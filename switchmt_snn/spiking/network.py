@@ -1,0 +1,262 @@
+"""The Q-network of all seven methods.
+
+Shapes: T simulation steps, B batch, C channels, H W image, K tasks, A actions, N neurons.
+
+    trunk  : nature   Conv 4->32 k8 s4 | Conv 32->64 k4 s2 | Conv 64->64 k3 s1, each with BatchNorm and neurons
+             minatar  Conv c->16 k3 s1 with BatchNorm and neurons
+             mlp      Linear ->hidden with neurons (no normalisation)
+    stream : Linear ->hidden, gain of the active dendrites, neurons, Linear ->outputs
+    plain  : one stream with A outputs                       (paper, section 3.1)
+    dueling: Q = V + A - mean_a(A), a stream for each
+
+Stateless layers see time folded into the batch ``[T*B, ...]``; only neurons walk over T. Under direct encoding the
+first layer and its BatchNorm are computed once, since every step has the same input. The head is linear, so for the
+``mean`` readout it is applied once, to the mean spikes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.spiking.dendrites import ActiveDendrites, keep_k_winners
+from switchmt_snn.spiking.encoding import Encoder
+from switchmt_snn.spiking.neurons import ReLULayer, SpikingLayer, make_neuron_layer
+from switchmt_snn.spiking.normalization import TaskBatchNorm
+
+CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "nature": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
+    "minatar": ((16, 3, 1),),
+    "mlp": (),
+}
+"""(output channels, kernel, stride) of each trunk's convolutions."""
+
+State = dict[str, Tensor]
+"""Membranes ``[B, ...]`` by layer name; an empty dict is the resting state."""
+
+
+@dataclass(frozen=True)
+class ObservationSpec:
+    """What the network is told about the tasks it serves.
+
+    Attributes:
+        shape: stacked observation, channels first: ``(k*c, H, W)`` or ``(k*features,)``.
+        frame_stack: frames k in it.
+        scale: factor that brings raw values to the network's range (1/255 for 8-bit images).
+        in_unit_range: whether scaled values lie in [0, 1].
+        num_actions: A, the same for every task.
+        num_tasks: K.
+    """
+
+    shape: tuple[int, ...]
+    frame_stack: int
+    scale: float
+    in_unit_range: bool
+    num_actions: int
+    num_tasks: int
+
+
+class TrunkLayer(nn.Module):
+    """Convolution (or linear map), BatchNorm, neurons."""
+
+    def __init__(self, synapses: nn.Module, normalization: TaskBatchNorm | None, neurons: SpikingLayer | ReLULayer):
+        super().__init__()
+        self.synapses = synapses
+        self.normalization = normalization
+        self.neurons = neurons
+
+    def current(self, x: Tensor, task: int) -> Tensor:
+        """Input currents ``[T, B, ...]`` of the neurons for inputs ``[T, B, ...]``, time folded into the batch."""
+        y = self.synapses(x.flatten(0, 1))
+        if self.normalization is not None:
+            y = self.normalization(y, task)
+        return cast(Tensor, y.unflatten(0, x.shape[:2]))
+
+
+class Stream(nn.Module):
+    """Linear, dendritic gain, neurons, linear head: one Q, value or advantage stream."""
+
+    def __init__(self, config: NetworkConfig, num_features: int, num_outputs: int, num_tasks: int, spiking: bool):
+        super().__init__()
+        hidden = cast(int, config.hidden_units)
+        self.synapses = nn.Linear(num_features, hidden)
+        has_dendrites = config.dendrites in ("shared", "per_neuron")
+        self.dendrites = ActiveDendrites(config, hidden, num_tasks) if has_dendrites else None
+        self.k_winners = config.k_winners
+        self.neurons = make_neuron_layer(config, spiking)
+        self.head = nn.Linear(hidden, num_outputs)
+
+    def current(self, x_TBN: Tensor, task: int) -> Tensor:
+        """Gated input currents ``[T, B, N]`` of the hidden neurons: Eq. 1's ``f(sum_i s_i, max_j d_j^T c)``."""
+        current_TBN = cast(Tensor, self.synapses(x_TBN))
+        if self.dendrites is not None:
+            current_TBN = current_TBN * self.dendrites(task)
+        if self.k_winners is not None:
+            current_TBN = keep_k_winners(current_TBN, self.k_winners)
+        return current_TBN
+
+
+class QNetwork(nn.Module):
+    """Observations of one task -> Q-values. Build it with :func:`build_network`.
+
+    Attributes:
+        config: the resolved network settings.
+        observation: what the input looks like.
+        trunk: layers that all streams share.
+        streams: ``{"q": ...}`` or ``{"value": ..., "advantage": ...}``.
+    """
+
+    def __init__(self, config: NetworkConfig, observation: ObservationSpec) -> None:
+        super().__init__()
+        traits = METHOD_TRAITS[config.method]
+        self.config = config
+        self.observation = observation
+        self.spiking = traits.spiking
+        self.encoder = Encoder(config, observation.frame_stack, observation.in_unit_range)
+        self.trunk = nn.ModuleDict()
+        shape = self._build_trunk()
+        features = math.prod(shape)
+        outputs = (
+            {"value": 1, "advantage": observation.num_actions} if traits.dueling else {"q": observation.num_actions}
+        )
+        self.streams = nn.ModuleDict(
+            {name: Stream(config, features, n, observation.num_tasks, self.spiking) for name, n in outputs.items()}
+        )
+
+    def _build_trunk(self) -> tuple[int, ...]:
+        """Append the trunk's layers and return the shape of the last one's output."""
+        config, observation = self.config, self.observation
+        channels = self.encoder.input_channels(observation.shape[0])
+        shape: tuple[int, ...] = (channels, *observation.shape[1:])
+        if config.trunk == "mlp":
+            hidden = cast(int, config.hidden_units)
+            # An image is flattened, so that the trunk takes any observation.
+            synapses = nn.Sequential(nn.Flatten(1), nn.Linear(math.prod(shape), hidden))
+            self.trunk["linear1"] = TrunkLayer(synapses, None, make_neuron_layer(config, self.spiking))
+            return (hidden,)
+        if len(shape) != 3:
+            raise ConfigError(
+                f"network.trunk is {config.trunk!r}, expected mlp for observations of shape {observation.shape}; "
+                "convolutions need images"
+            )
+        for index, (out_channels, kernel, stride) in enumerate(CONVOLUTIONS[config.trunk], start=1):
+            convolution = nn.Conv2d(shape[0], out_channels, kernel, stride)
+            height, width = ((side - kernel) // stride + 1 for side in shape[1:])
+            if height < 1 or width < 1:
+                raise ConfigError(
+                    f"network.trunk is {config.trunk!r}, expected another trunk for {observation.shape[1]}x"
+                    f"{observation.shape[2]} images; convolution {index} has no output left"
+                )
+            shape = (out_channels, height, width)
+            normalization = TaskBatchNorm(
+                out_channels, observation.num_tasks, config.normalization == "per_task", config.normalization_momentum
+            )
+            self.trunk[f"conv{index}"] = TrunkLayer(convolution, normalization, make_neuron_layer(config, self.spiking))
+        return shape
+
+    def forward(
+        self,
+        observation: Tensor,
+        task: int,
+        *,
+        state: State | None = None,
+        activity: dict[str, Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Q-values of a batch of observations of one task.
+
+        Args:
+            observation: ``[B, *shape]``, raw (uint8 or float).
+            task: task index k.
+            state: membranes to start from; changed in place to the membranes after the decision. None or an empty
+                dict starts from rest and, if None, keeps nothing.
+            activity: if given, filled with each neuron layer's spikes (or activations) ``[T, B, ...]`` by name.
+            generator: source of random numbers of the ``rate`` encoding.
+
+        Returns:
+            ``[B, A]`` float Q-values.
+        """
+        state = {} if state is None else state
+        x = self.encoder(observation.to(torch.float32) * self.observation.scale, generator)
+        for name, layer in self.trunk.items():
+            current = self._over_time(cast(TrunkLayer, layer).current(x, task))
+            x = self._fire(name, cast(TrunkLayer, layer), current, state, activity)
+        features_TBN = x.flatten(2)
+        outputs = {
+            name: self._readout(name, cast(Stream, stream), features_TBN, task, state, activity)
+            for name, stream in self.streams.items()
+        }
+        return self._combine(outputs)
+
+    def _over_time(self, current: Tensor) -> Tensor:
+        """Repeat ``[1, B, ...]`` over T: direct encoding's first layer has the same current at every step."""
+        return current.expand(self.config.timesteps, *current.shape[1:]) if current.shape[0] == 1 else current
+
+    def _fire(
+        self,
+        name: str,
+        layer: TrunkLayer | Stream,
+        current: Tensor,
+        state: State,
+        activity: dict[str, Tensor] | None,
+    ) -> Tensor:
+        spikes, membrane = layer.neurons(current, state.get(name))
+        if membrane is not None:
+            state[name] = membrane
+        if activity is not None:
+            activity[name] = spikes
+        return cast(Tensor, spikes)
+
+    def _readout(
+        self,
+        name: str,
+        stream: Stream,
+        features_TBN: Tensor,
+        task: int,
+        state: State,
+        activity: dict[str, Tensor] | None,
+    ) -> Tensor:
+        """The stream's output: ``[B, outputs]`` (mean, last_membrane) or ``[T, B, outputs]`` (max_membrane)."""
+        spikes_TBN = self._fire(name, stream, stream.current(features_TBN, task), state, activity)
+        if self.config.readout == "mean":
+            return cast(Tensor, stream.head(spikes_TBN.mean(0)))
+        outputs_t = stream.head(spikes_TBN)
+        membranes = [outputs_t[0]]
+        for output_t in outputs_t[1:]:
+            membranes.append(self.config.readout_beta * membranes[-1] + output_t)
+        return membranes[-1] if self.config.readout == "last_membrane" else torch.stack(membranes)
+
+    def _combine(self, outputs: dict[str, Tensor]) -> Tensor:
+        if "q" in outputs:
+            q = outputs["q"]
+        else:
+            advantage = outputs["advantage"]
+            q = outputs["value"] + advantage - advantage.mean(-1, keepdim=True)
+        return q.amax(0) if self.config.readout == "max_membrane" else q
+
+    def neuron_layers(self) -> Iterator[str]:
+        """Names of the neuron layers in forward order, as used in ``activity`` and ``state``."""
+        yield from self.trunk
+        yield from self.streams
+
+
+def build_network(config: NetworkConfig, observation: ObservationSpec, seed: int) -> QNetwork:
+    """A freshly initialised network (PyTorch's default initialisation), the same for the same seed.
+
+    The global torch generator is left as it was.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return QNetwork(config, observation)
+
+
+def trainable_parameters(network: nn.Module) -> int:
+    """Number of trainable parameters (paper, Table 3)."""
+    return sum(parameter.numel() for parameter in network.parameters() if parameter.requires_grad)

@@ -1,0 +1,171 @@
+"""Neuron layers over T simulation steps, built from ``snntorch.Leaky``, with the membrane passed in and handed back.
+
+Shapes: T simulation steps, B batch, ... any feature shape.
+
+Per step (snnTorch 1.0 with ``reset_delay=True``; strict ``>``; H the Heaviside step, theta the threshold)::
+
+    R(t) = H(U(t-1) - theta)                               the reset owed by the last spike; no gradient
+    zero:      U(t) = beta * (1 - R(t)) * U(t-1) + I(t)
+    subtract:  U(t) = beta * U(t-1) + I(t) - R(t) * theta
+    S(t) = H(U(t) - theta)                                 gradient: the surrogate
+
+U(t) is the membrane *before* the reset that its own spike causes, as in snnTorch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import snntorch
+import torch
+from snntorch import surrogate as snntorch_surrogate
+from torch import Tensor, nn
+
+from switchmt_snn.config import NetworkConfig
+
+Surrogate = Callable[[Tensor], Tensor]
+
+_SLOPE_ARGUMENT = {
+    "atan": "alpha",
+    "sigmoid": "slope",
+    "fast_sigmoid": "slope",
+    "triangular": "threshold",
+    "spike_rate_escape": "slope",
+    "SFS": "slope",
+}
+
+
+def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
+    """Return ``snntorch.surrogate.<name>``, with its slope argument if one is given and the surrogate has one."""
+    factory = getattr(snntorch_surrogate, name)
+    if slope is None or name not in _SLOPE_ARGUMENT:
+        return factory()  # type: ignore[no-any-return]
+    return factory(**{_SLOPE_ARGUMENT[name]: slope})  # type: ignore[no-any-return]
+
+
+class NeuronLayer(Protocol):
+    """Input currents over time -> spikes (or activations) over time, and the state to continue from."""
+
+    def __call__(self, current: Tensor, membrane: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Map ``[T, B, ...]`` to ``[T, B, ...]``; ``membrane`` ``[B, ...]`` or None for the resting state 0."""
+
+
+class ReLULayer(nn.Module):
+    """The ANN methods' neuron: no time, no state."""
+
+    def forward(self, current: Tensor, membrane: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """Return ``relu(current)`` and no state."""
+        return torch.relu(current), None
+
+
+class SpikingLayer(nn.Module):
+    """IF or LIF neurons (``snntorch.Leaky``) over T steps with explicit state.
+
+    ``engine="snntorch"`` calls ``snntorch.Leaky`` step by step; ``"fused"`` does the same float32 arithmetic in one
+    autograd function (bitwise equal forward, gradients equal to rounding; tests/test_neurons.py). Learnable beta or
+    threshold, and the stochastic surrogate SSO, always run through ``snntorch.Leaky``.
+
+    Attributes:
+        leaky: the snnTorch neuron; holds beta, threshold, reset mechanism and surrogate. Its own ``mem`` is never used.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.leaky = snntorch.Leaky(
+            beta=1.0 if config.neuron == "IF" else config.beta,
+            threshold=config.threshold,
+            spike_grad=make_surrogate(config.surrogate, config.surrogate_slope),
+            learn_beta=config.learn_beta,
+            learn_threshold=config.learn_threshold,
+            reset_mechanism=config.reset,
+            reset_delay=True,
+        )
+        # snnTorch keeps every neuron it ever made in one process-wide list, for its hidden-state helpers. State is
+        # explicit here, and the list would keep discarded networks alive.
+        snntorch.SpikingNeuron.instances.remove(self.leaky)
+        self.reset = config.reset
+        # SSO draws random gradients: one draw per step in snn.Leaky, which a single backward over T would change.
+        needs_leaky = config.learn_beta or config.learn_threshold or config.surrogate == "SSO"
+        self.fused = config.neuron_engine == "fused" and not needs_leaky
+
+    def forward(self, current: Tensor, membrane: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Run T steps.
+
+        Args:
+            current: ``[T, B, ...]`` float input currents.
+            membrane: ``[B, ...]`` state U(0) to start from; None is 0 (rest).
+
+        Returns:
+            spikes ``[T, B, ...]`` in {0, 1}, and the last membrane U(T) ``[B, ...]``.
+        """
+        if membrane is None:
+            membrane = torch.zeros_like(current[0])
+        if self.fused:
+            # The two parameters are fixed numbers; reading them as floats keeps the step free of broadcasts.
+            beta, threshold = float(self.leaky.beta.clamp(0, 1)), float(self.leaky.threshold)
+            fused: tuple[Tensor, Tensor] = _FusedLeaky.apply(  # type: ignore[no-untyped-call]
+                current, membrane, beta, threshold, self.reset == "zero", self.leaky.spike_grad
+            )
+            return fused
+        return self._step_by_step(current, membrane)
+
+    def _step_by_step(self, current: Tensor, membrane: Tensor) -> tuple[Tensor, Tensor]:
+        spikes = []
+        for current_t in current:
+            spikes_t, membrane = self.leaky(current_t, membrane)
+            spikes.append(spikes_t)
+        self.leaky.mem = torch.zeros(0, device=current.device)
+        return torch.stack(spikes), membrane
+
+
+class _FusedLeaky(torch.autograd.Function):
+    """T steps of ``snntorch.Leaky`` with fixed beta and threshold; saves only the membranes."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, current: Tensor, membrane: Tensor, beta: float, threshold: float, zero: bool, spike_grad: Surrogate
+    ) -> tuple[Tensor, Tensor]:
+        membranes = torch.empty_like(current, memory_format=torch.contiguous_format)
+        nothing = current.new_zeros(())
+        previous, fired = membrane, membrane > threshold
+        for t in range(current.shape[0]):
+            u = membranes[t]
+            # torch.where keeps one dtype throughout: several times faster than arithmetic on the boolean spikes.
+            if zero:
+                torch.where(fired, nothing, previous, out=u)
+                if beta != 1.0:
+                    u.mul_(beta)
+                u.add_(current[t])
+            else:
+                torch.add(previous if beta == 1.0 else previous * beta, current[t], out=u)
+                torch.where(fired, u - threshold, u, out=u)
+            previous, fired = u, u > threshold
+        ctx.save_for_backward(membranes, membrane)
+        ctx.beta, ctx.threshold, ctx.zero, ctx.spike_grad = beta, threshold, zero, spike_grad
+        return (membranes > threshold).to(current.dtype), membranes[-1].clone()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        grad_spikes, grad_last = gradients
+        membranes, initial = ctx.saved_tensors
+        # dS/dU from the surrogate itself: any element-wise surrogate of snnTorch works, with its own backward.
+        with torch.enable_grad():
+            shifted = (membranes - ctx.threshold).requires_grad_()
+            (grad,) = torch.autograd.grad(ctx.spike_grad(shifted), shifted, grad_spikes)
+        grad[-1] += grad_last
+        nothing = grad.new_zeros(())
+        for t in range(membranes.shape[0] - 2, -1, -1):
+            carried = grad[t + 1] * ctx.beta if ctx.beta != 1.0 else grad[t + 1]
+            grad[t] += torch.where(membranes[t] > ctx.threshold, nothing, carried) if ctx.zero else carried
+        grad_initial = None
+        if ctx.needs_input_grad[1]:
+            grad_initial = grad[0] * ctx.beta
+            if ctx.zero:
+                grad_initial = torch.where(initial > ctx.threshold, nothing, grad_initial)
+        return grad, grad_initial, None, None, None, None
+
+
+def make_neuron_layer(config: NetworkConfig, spiking: bool) -> SpikingLayer | ReLULayer:
+    """The neuron layer of a method: ``snntorch.Leaky`` over time, or ReLU for the ANN methods."""
+    return SpikingLayer(config) if spiking else ReLULayer()

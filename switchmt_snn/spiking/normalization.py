@@ -1,0 +1,42 @@
+"""Batch normalisation whose running statistics may be kept per task.
+
+A minibatch of Algorithm 1 comes from one task, so statistics shared by all tasks describe whichever task was trained
+last (docs/algorithm.md, deviation 6). Affine weights are shared always, so the parameter count does not change.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class TaskBatchNorm(nn.Module):
+    """BatchNorm over ``[B, C, ...]`` with running mean and variance for each task (rows of ``[K, C]`` buffers).
+
+    When T simulation steps are folded into the batch (``[T*B, C, ...]``), statistics are pooled over time and batch.
+    """
+
+    running_mean_KC: Tensor
+    running_var_KC: Tensor
+
+    def __init__(self, num_channels: int, num_tasks: int, per_task: bool, momentum: float, epsilon: float = 1e-5):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num_channels))
+        self.bias = nn.Parameter(torch.zeros(num_channels))
+        rows = num_tasks if per_task else 1
+        self.register_buffer("running_mean_KC", torch.zeros(rows, num_channels))
+        self.register_buffer("running_var_KC", torch.ones(rows, num_channels))
+        self.momentum = momentum
+        self.epsilon = epsilon
+
+    def forward(self, x: Tensor, task: int) -> Tensor:
+        """Normalise by the batch in training mode (and move the task's running statistics), by the task's running
+        statistics in eval mode."""
+        mean_C, var_C = self.statistics(task)
+        return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, self.training, self.momentum, self.epsilon)
+
+    def statistics(self, task: int) -> tuple[Tensor, Tensor]:
+        """Running mean and variance ``[C]`` that eval mode uses for a task (views of the buffers)."""
+        row = task if self.running_mean_KC.shape[0] > 1 else 0
+        return self.running_mean_KC[row], self.running_var_KC[row]

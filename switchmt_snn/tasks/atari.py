@@ -1,0 +1,108 @@
+"""Atari games through ale-py's vector environment: 84x84 grey frames, frame skip with max-pooling, raw rewards."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from ale_py import Action, roms
+from ale_py.vector_env import AtariVectorEnv
+
+from switchmt_snn.config import TasksConfig
+from switchmt_snn.errors import TaskError, did_you_mean
+from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES
+from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite, VectorStep
+
+SIDE_PIXELS = 84
+
+
+class AtariCopies:
+    """Copies of one game. Frames are single (stacking is done once, in :mod:`switchmt_snn.tasks.play`)."""
+
+    def __init__(self, game: str, num_envs: int, config: TasksConfig) -> None:
+        """Open the game; every option of AtariVectorEnv that changes what is learned is set explicitly."""
+        self.num_envs = num_envs
+        self._env = AtariVectorEnv(
+            game,
+            num_envs,
+            max_num_frames_per_episode=config.max_episode_frames,
+            repeat_action_probability=config.sticky_action_probability,
+            full_action_space=config.full_action_space,
+            img_height=SIDE_PIXELS,
+            img_width=SIDE_PIXELS,
+            grayscale=True,
+            stack_num=1,
+            frameskip=config.frame_skip,
+            maxpool=config.frame_skip > 1,
+            noop_max=config.noop_max,
+            episodic_life=False,
+            reward_clipping=False,
+            use_fire_reset=config.fire_on_reset,
+        )
+        self._started = False
+
+    def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+        """Start episodes: no-ops (number drawn from the seed) and FIRE happen inside."""
+        if not self._started:
+            # The first reset of a vector environment must be whole; copies not asked for get a seed of no consequence.
+            self._env.reset(seed=np.zeros(self.num_envs, np.int64))
+            self._started = True
+        mask = np.zeros(self.num_envs, np.bool_)
+        mask[env_ids] = True
+        order = np.argsort(env_ids)
+        observations, _ = self._env.reset(seed=seeds[order], options={"reset_mask": mask})
+        return np.asarray(observations[env_ids], np.uint8)
+
+    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
+        """Step all copies; a copy whose episode ended in the last step and was not reset returns a fresh start."""
+        observations, rewards, terminated, truncated, _ = self._env.step(actions)
+        return VectorStep(observations, rewards.astype(np.float64), terminated.copy(), truncated.copy())
+
+    def close(self) -> None:
+        """Free the emulators."""
+        self._env.close()
+
+
+def make_atari_suite(config: TasksConfig) -> TaskSuite:
+    """Suite of ALE games by ROM name (``pong``, ``space_invaders``).
+
+    Raises:
+        TaskError: unknown game, or games of different action counts without ``full_action_space``.
+    """
+    known = roms.get_all_rom_ids()
+    for name in config.names:
+        if name not in known:
+            raise TaskError(f"tasks.names has the unknown Atari game {name!r}{did_you_mean(name, known)}")
+    if config.full_action_space:
+        action_names = tuple(action.name for action in Action.__members__.values())[:18]
+    else:
+        counts = {name: _minimal_actions(name, config) for name in config.names}
+        if len(set(counts.values())) > 1:
+            shown = ", ".join(f"{name} {len(actions)}" for name, actions in counts.items())
+            raise TaskError(
+                f"tasks.full_action_space is false and the games' minimal action sets differ ({shown}), "
+                "expected one meaning per action; set tasks.full_action_space to true"
+            )
+        action_names = next(iter(counts.values()))
+
+    def make(task: int, num_envs: int) -> TaskEnvironment:
+        return AtariCopies(config.names[task], num_envs, config)
+
+    return TaskSuite(
+        names=config.names,
+        frame_shape=(1, SIDE_PIXELS, SIDE_PIXELS),
+        frame_dtype=np.uint8,
+        frame_stack=config.frame_stack or 4,
+        scale=1.0 / 255.0,
+        in_unit_range=True,
+        action_names=action_names,
+        valid_actions_KA=np.ones((len(config.names), len(action_names)), np.bool_),
+        references={name: ATARI_REFERENCES[name] for name in config.names if name in ATARI_REFERENCES},
+        make=make,
+    )
+
+
+def _minimal_actions(game: str, config: TasksConfig) -> tuple[str, ...]:
+    env = AtariVectorEnv(game, 1, full_action_space=False, use_fire_reset=config.fire_on_reset)
+    names = tuple(action.name for action in env.ale.get_action_set())
+    env.close()
+    return names

@@ -1,0 +1,1 @@
+"""Seeing a run: progress, health, tables. Nothing here is imported by learning."""

@@ -1,0 +1,171 @@
+"""Progress of a training: a live table in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
+from switchmt_snn.learning.run_folder import RunFolder
+from switchmt_snn.learning.switching import SwitchTo
+from switchmt_snn.learning.training import Training
+from switchmt_snn.viewing.health import health_warnings
+
+RETURN_WINDOW_EPISODES = 20
+PLAIN_EVERY_S = 15.0
+LIVE_EVERY_S = 0.5
+
+
+class Progress:
+    """An observer that shows where a run stands; see :class:`switchmt_snn.learning.run.Observer`."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self._live: Live | None = None
+        self._epsilon = 1.0
+        self._warming_up = False
+        self._warnings: list[str] = []
+        self._distance = ""
+        self._shown_at = 0.0
+        self._loss: float | None = None
+        self._q: float | None = None
+
+    def start(self, training: Training, folder: RunFolder, resumed_at: int | None) -> None:
+        """Greet, and open the live table if there is a terminal."""
+        self._training = training
+        self._returns: list[deque[float]] = [deque(maxlen=RETURN_WINDOW_EPISODES) for _ in training.suite.names]
+        self._started, self._first_step = time.monotonic(), training.steps
+        config = training.config
+        network, skip = config.network, config.tasks.frame_skip if config.tasks.suite == "atari" else 1
+        where = f"continuing {folder.path} at step {resumed_at:,}" if resumed_at is not None else f"run {folder.path}"
+        self.console.print(
+            f"{where}: {network.method} on {', '.join(training.suite.names)}, T={network.timesteps}, "
+            f"{network.encoding} encoding, switching {config.switching.policy}, "
+            f"{config.total_steps:,} agent steps ({config.total_steps * skip:,} emulator frames), "
+            f"{training.learner.device}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        if self.console.is_terminal:
+            self._live = Live(self._table(), console=self.console, refresh_per_second=4, transient=False)
+            self._live.start()
+
+    def __call__(self, event: Event) -> None:
+        """Take an event in; redraw now and then."""
+        if isinstance(event, Stepped):
+            self._epsilon, self._warming_up = event.epsilon, event.warming_up
+            self._show()
+        elif isinstance(event, EpisodeEnded):
+            self._returns[event.task].append(event.episode_return)
+        elif isinstance(event, Measured):
+            self._loss, self._q = event.loss, event.q
+            self._warnings = health_warnings(event)
+        elif isinstance(event, SwitchDecided):
+            self._distance = _distance(event)
+
+    def note(self, text: str) -> None:
+        """Print a line (above the live table)."""
+        self.console.print(text, highlight=False, soft_wrap=True)
+
+    def stop(self) -> None:
+        """Draw the last state and close the live table."""
+        if self._live is not None:
+            self._live.update(self._table())
+            self._live.stop()
+            self._live = None
+        else:
+            self._print_line()
+
+    def _show(self) -> None:
+        now = time.monotonic()
+        if now - self._shown_at < (LIVE_EVERY_S if self._live else PLAIN_EVERY_S):
+            return
+        self._shown_at = now
+        if self._live is not None:
+            self._live.update(self._table())
+        else:
+            self._print_line()
+
+    def _rate(self) -> tuple[float, str]:
+        """Steps per second of this call, and the time left."""
+        training = self._training
+        made, spent = training.steps - self._first_step, time.monotonic() - self._started
+        rate = made / spent if spent > 0 else 0.0
+        left = (training.config.total_steps - training.steps) / rate if rate else 0.0
+        return rate, time.strftime("%H:%M:%S", time.gmtime(max(0.0, left)))
+
+    def _print_line(self) -> None:
+        training = self._training
+        rate, left = self._rate()
+        tasks = ", ".join(
+            f"{'>' if index == training.task else ''}{name} {_mean(self._returns[index])} "
+            f"({training.steps_by_task[index]:,})"
+            for index, name in enumerate(training.suite.names)
+        )
+        self.console.print(
+            f"step {training.steps:,}/{training.config.total_steps:,} {rate:.0f}/s left {left} "
+            f"epsilon {self._epsilon:.3f} return (steps): {tasks}{self._learning()}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        for line in self._health():
+            self.console.print(f"  {line}", highlight=False, soft_wrap=True)
+
+    def _learning(self) -> str:
+        return "" if self._loss is None else f" loss {self._loss:.4g} Q {self._q or 0.0:.3f}"
+
+    def _health(self) -> list[str]:
+        lines = [f"warning: {text}" for text in self._warnings]
+        if self._warming_up:
+            starts = self._training.config.learning.learning_starts_steps
+            lines.append(f"filling this task's replay: random actions until {starts:,} transitions")
+        return lines
+
+    def _table(self) -> Group:
+        training = self._training
+        rate, left = self._rate()
+        table = Table(title_justify="left", expand=False)
+        for name in ("task", "episodes", f"return (last {RETURN_WINDOW_EPISODES})", "steps", "epsilon", "switch"):
+            table.add_column(name, justify="left" if name in ("task", "switch") else "right")
+        for index, name in enumerate(training.suite.names):
+            current = index == training.task
+            table.add_row(
+                f"> {name}" if current else f"  {name}",
+                str(training.episodes_by_task[index]),
+                _mean(self._returns[index]),
+                f"{training.steps_by_task[index]:,}",
+                f"{self._epsilon:.3f}" if current else "",
+                f"{training.steps_in_visit:,} steps in visit {training.visit}; {self._distance}" if current else "",
+                style="bold" if current else "",
+            )
+        status = Text(
+            f"step {training.steps:,} of {training.config.total_steps:,}, {rate:.0f} steps/s, left {left}, "
+            f"updates {training.learner.updates:,}{self._learning()}"
+        )
+        return Group(table, status, *(Text(line, style="yellow") for line in self._health()))
+
+
+def _mean(values: deque[float]) -> str:
+    return f"{sum(values) / len(values):.2f}" if values else "-"
+
+
+def _distance(event: SwitchDecided) -> str:
+    """How far the last decision was from a switch, in the policy's own numbers."""
+    decision, measured = event.decision, event.decision.measured
+    if isinstance(decision, SwitchTo):
+        return f"switched ({decision.reason})"
+    pairs = (
+        ("parameter_change", "change_threshold", "change {:.1%} of {:.1%}"),
+        ("episodes_in_visit", "visit_episodes", "episode {:.0f} of {:.0f}"),
+        ("steps_in_visit", "visit_steps", "step {:.0f} of {:.0f}"),
+        ("reward_t", "plateau_t", "return slope {:.2f} of {:.2f} s.e."),
+    )
+    for seen, limit, text in pairs:
+        if seen in measured and limit in measured:
+            return text.format(measured[seen], measured[limit])
+    return decision.reason.replace("_", " ")

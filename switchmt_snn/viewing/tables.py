@@ -1,0 +1,107 @@
+"""Tables of evaluations and descriptions for the terminal."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from switchmt_snn.learning.description import MethodDescription
+from switchmt_snn.learning.evaluation import Evaluation, TaskScore
+from switchmt_snn.learning.memory import GIB
+from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PAPER_SCORES
+
+
+def evaluation_table(evaluation: Evaluation) -> Table:
+    """Scores of agent and random policy, and published rows for Atari games beneath."""
+    table = Table(title=f"Scores at step {evaluation.step:,}", caption=str(evaluation.protocol), title_justify="left")
+    table.add_column("policy")
+    table.add_column("task")
+    for name in ("mean", "± s.e.", "median", "human-norm.", "length (steps)", "mean Q", "episodes"):
+        table.add_column(name, justify="right")
+    for row in evaluation.tasks:
+        table.add_row(*_score_cells(row))
+    if evaluation.protocol.suite == "atari":
+        table.add_section()
+        names = list(dict.fromkeys(row.task for row in evaluation.tasks))
+        for policy, task, mean in published_rows(names):
+            table.add_row(policy, task, f"{mean:.1f}", "", "", _percent(_normalized(task, mean)), "", "", "")
+    return table
+
+
+def published_rows(tasks: list[str]) -> list[tuple[str, str, float]]:
+    """Published raw scores of tasks: (policy, task, mean)."""
+    rows = [(policy, task, scores[task]) for policy, scores in PAPER_SCORES.items() for task in tasks if task in scores]
+    for task in tasks:
+        if task in ATARI_REFERENCES:
+            reference = ATARI_REFERENCES[task]
+            rows += [("random (Wang 2016)", task, reference.random), ("human (Wang 2016)", task, reference.human)]
+    return rows
+
+
+def _normalized(task: str, score: float) -> float | None:
+    reference = ATARI_REFERENCES.get(task)
+    return None if reference is None else (score - reference.random) / (reference.human - reference.random)
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.1%}"
+
+
+def _score_cells(row: TaskScore) -> list[str]:
+    return [
+        row.policy,
+        row.task,
+        f"{row.mean:.2f}",
+        "" if row.standard_error is None else f"{row.standard_error:.2f}",
+        f"{row.median:.1f}",
+        _percent(row.human_normalized),
+        f"{row.mean_length_steps:,.0f}",
+        "" if row.mean_q is None else f"{row.mean_q:.3f}",
+        str(row.episodes),
+    ]
+
+
+def methods_table(methods: dict[str, MethodDescription]) -> Table:
+    """One row per method."""
+    table = Table(title="Methods under this config", title_justify="left")
+    table.add_column("method")
+    for name in ("parameters", "neurons", "T", "dense ops/decision", "neuron updates/decision", "memory of a run"):
+        table.add_column(name, justify="right")
+    table.add_column("switching")
+    for method in methods.values():
+        table.add_row(
+            method.method,
+            f"{method.trainable_parameters:,}",
+            f"{method.neurons:,}",
+            str(method.timesteps),
+            f"{method.dense_operations_per_decision:,}",
+            f"{method.neuron_updates_per_decision:,}",
+            f"{method.memory.total_bytes / GIB:.2f} GiB",
+            method.switching_policy,
+        )
+    return table
+
+
+def layers_table(method: MethodDescription) -> Table:
+    """The layers of one method."""
+    memory = method.memory
+    parts = (
+        f"memory: replay {memory.replay_bytes / GIB:.2f} GiB, networks and optimiser {memory.network_bytes / GIB:.2f}, "
+        f"snapshots {memory.switching_bytes / GIB:.2f}, activations {memory.activations_bytes / GIB:.2f}"
+    )
+    table = Table(title=f"Layers of {method.method}", caption=parts, title_justify="left")
+    table.add_column("layer")
+    table.add_column("kind")
+    for name in ("input", "output", "parameters", "neurons", "ops/step", "steps"):
+        table.add_column(name, justify="right")
+    for layer in method.layers:
+        table.add_row(
+            layer.name,
+            layer.kind,
+            "x".join(map(str, layer.input_shape)),
+            "x".join(map(str, layer.output_shape)),
+            f"{layer.parameters:,}",
+            f"{layer.neurons:,}",
+            f"{layer.operations_per_step:,}",
+            str(layer.steps),
+        )
+    return table
