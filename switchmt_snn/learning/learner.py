@@ -62,7 +62,9 @@ class Learner(Stateful):
         self.device = device
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon, fused=True
+        )
         self.generator = torch.Generator(device).manual_seed(seed)
         self.updates = 0
         self._invalid_KA = torch.as_tensor(~valid_actions_KA, device=device)

@@ -233,4 +233,4 @@ class FrameReplay:
             held = min(int(self._written[lane]), self.slots)
             assert self._actions[slot] >= 0, "a valid slot has an action"
             assert behind_newest >= 1, "a valid slot has a next frame"
-            assert behind_newest + self._age[slot] < held, "a valid slot's stack is held"
+            assert behind_newest + int(self._age[slot]) < held, "a valid slot's stack is held"

@@ -26,6 +26,7 @@ from switchmt_snn.config import NetworkConfig
 
 Surrogate = Callable[[Tensor], Tensor]
 
+_SIGMOID_SLOPE = 25.0
 _SLOPE_ARGUMENT = {
     "atan": "alpha",
     "sigmoid": "slope",
@@ -37,11 +38,18 @@ _SLOPE_ARGUMENT = {
 
 
 def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
-    """Return ``snntorch.surrogate.<name>``, with its slope argument if one is given and the surrogate has one."""
+    """Return ``snntorch.surrogate.<name>``, with its slope argument if one is given and the surrogate has one.
+
+    The gradient of snnTorch's sigmoid is exp(-k x) / (1 + exp(-k x))^2, which is inf / inf = NaN in float32 once
+    k x < -88 (a membrane 3.6 below the threshold at the default k = 25). Its true value there is 0, and so is ours.
+    """
     factory = getattr(snntorch_surrogate, name)
-    if slope is None or name not in _SLOPE_ARGUMENT:
-        return factory()  # type: ignore[no-any-return]
-    return factory(**{_SLOPE_ARGUMENT[name]: slope})  # type: ignore[no-any-return]
+    arguments = {} if slope is None or name not in _SLOPE_ARGUMENT else {_SLOPE_ARGUMENT[name]: slope}
+    surrogate: Surrogate = factory(**arguments)
+    if name != "sigmoid":
+        return surrogate
+    lowest = -80.0 / arguments.get("slope", _SIGMOID_SLOPE)
+    return lambda x: surrogate(x.clamp(min=lowest))
 
 
 class NeuronLayer(Protocol):

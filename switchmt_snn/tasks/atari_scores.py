@@ -78,6 +78,6 @@ PAPER_SCORES: dict[str, dict[str, float]] = {
     "MTSpark_AD (paper)": {"pong": -9.4, "breakout": 2.0, "enduro": 363.2},
     "MTSpark_ADD (paper)": {"pong": -5.4, "breakout": 0.6, "enduro": 371.2},
     "SwitchMT (paper)": {"pong": -8.8, "breakout": 5.6, "enduro": 355.2},
-    "human (quoted by the paper)": {"pong": -3.0, "breakout": 31.0, "enduro": 368.0},
+    "human (paper)": {"pong": -3.0, "breakout": 31.0, "enduro": 368.0},
 }
 """Raw scores of the SwitchMT paper (its performance table and its ablation text): five episodes, one seed."""

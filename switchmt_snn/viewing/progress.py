@@ -30,6 +30,7 @@ class Progress:
         self._epsilon = 1.0
         self._warming_up = False
         self._warnings: list[str] = []
+        self._said: list[str] = []  # a plain log repeats no warning that still holds
         self._distance = ""
         self._shown_at = 0.0
         self._loss: float | None = None
@@ -113,8 +114,11 @@ class Progress:
             highlight=False,
             soft_wrap=True,
         )
-        for line in self._health():
-            self.console.print(f"  {line}", highlight=False, soft_wrap=True)
+        health = self._health()
+        for line in health:
+            if line not in self._said:
+                self.console.print(f"  {line}", highlight=False, soft_wrap=True)
+        self._said = health
 
     def _learning(self) -> str:
         return "" if self._loss is None else f" loss {self._loss:.4g} Q {self._q or 0.0:.3f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rich import box
 from rich.table import Table
 
 from switchmt_snn.learning.description import MethodDescription
@@ -10,13 +11,30 @@ from switchmt_snn.learning.memory import GIB
 from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PAPER_SCORES
 
 
+def _table(title: str, caption: str | None = None) -> Table:
+    """A table that fits 80 columns."""
+    return Table(
+        title=title,
+        caption=caption,
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+
+
+def _add_columns(table: Table, left: tuple[str, ...], right: tuple[str, ...]) -> None:
+    for name in left:
+        table.add_column(name, no_wrap=True)
+    for name in right:
+        table.add_column(name, justify="right", no_wrap=True)
+
+
 def evaluation_table(evaluation: Evaluation) -> Table:
     """Scores of agent and random policy, and published rows for Atari games beneath."""
-    table = Table(title=f"Scores at step {evaluation.step:,}", caption=str(evaluation.protocol), title_justify="left")
-    table.add_column("policy")
-    table.add_column("task")
-    for name in ("mean", "± s.e.", "median", "human-norm.", "length (steps)", "mean Q", "episodes"):
-        table.add_column(name, justify="right")
+    table = _table(f"Scores at step {evaluation.step:,}", str(evaluation.protocol))
+    _add_columns(table, ("policy", "task"), ("mean", "± s.e.", "median", "human", "steps", "mean Q", "n"))
     for row in evaluation.tasks:
         table.add_row(*_score_cells(row))
     if evaluation.protocol.suite == "atari":
@@ -43,7 +61,7 @@ def _normalized(task: str, score: float) -> float | None:
 
 
 def _percent(value: float | None) -> str:
-    return "" if value is None else f"{value:.1%}"
+    return "" if value is None else f"{value:.0%}"
 
 
 def _score_cells(row: TaskScore) -> list[str]:
@@ -62,20 +80,17 @@ def _score_cells(row: TaskScore) -> list[str]:
 
 def methods_table(methods: dict[str, MethodDescription]) -> Table:
     """One row per method."""
-    table = Table(title="Methods under this config", title_justify="left")
-    table.add_column("method")
-    for name in ("parameters", "neurons", "T", "dense ops/decision", "neuron updates/decision", "memory of a run"):
-        table.add_column(name, justify="right")
-    table.add_column("switching")
+    table = _table("Methods under this config", "ops: dense synaptic operations per decision, in millions; T: simulation steps")
+    _add_columns(table, ("method",), ("parameters", "neurons", "T", "ops (M)", "GiB"))
+    table.add_column("switching", no_wrap=True)
     for method in methods.values():
         table.add_row(
             method.method,
             f"{method.trainable_parameters:,}",
             f"{method.neurons:,}",
             str(method.timesteps),
-            f"{method.dense_operations_per_decision:,}",
-            f"{method.neuron_updates_per_decision:,}",
-            f"{method.memory.total_bytes / GIB:.2f} GiB",
+            f"{method.dense_operations_per_decision / 1e6:,.2f}",
+            f"{method.memory.total_bytes / GIB:.2f}",
             method.switching_policy,
         )
     return table
@@ -88,15 +103,11 @@ def layers_table(method: MethodDescription) -> Table:
         f"memory: replay {memory.replay_bytes / GIB:.2f} GiB, networks and optimiser {memory.network_bytes / GIB:.2f}, "
         f"snapshots {memory.switching_bytes / GIB:.2f}, activations {memory.activations_bytes / GIB:.2f}"
     )
-    table = Table(title=f"Layers of {method.method}", caption=parts, title_justify="left")
-    table.add_column("layer")
-    table.add_column("kind")
-    for name in ("input", "output", "parameters", "neurons", "ops/step", "steps"):
-        table.add_column(name, justify="right")
+    table = _table(f"Layers of {method.method}", parts)
+    _add_columns(table, ("layer",), ("input", "output", "parameters", "neurons", "ops/step", "steps"))
     for layer in method.layers:
         table.add_row(
             layer.name,
-            layer.kind,
             "x".join(map(str, layer.input_shape)),
             "x".join(map(str, layer.output_shape)),
             f"{layer.parameters:,}",

@@ -1,0 +1,156 @@
+"""The replay memory against a naive list of whole transitions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from switchmt_snn.learning.replay import SEGMENT_SLOTS, FrameReplay, Segment
+
+
+@dataclass
+class NaiveLane:
+    """Keeps every transition whole, and how many slots were written when its oldest frame was."""
+
+    slots: int
+    stack: int
+    shape: tuple[int, ...]
+    episode: list[npt.NDArray[np.uint8]] = field(default_factory=list)
+    transitions: list[dict] = field(default_factory=list)
+    written: int = 0
+
+    def begin(self, frame: npt.NDArray[np.uint8]) -> None:
+        self.episode = [frame]
+        self.written += 1
+
+    def stacked(self, frames: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
+        padding = [np.zeros(self.shape, np.uint8)] * self.stack
+        return np.concatenate((padding + frames)[-self.stack :])
+
+    def add(self, action: int, reward: float, terminated: bool, frame: npt.NDArray[np.uint8]) -> None:
+        observation = self.stacked(self.episode)
+        reach = min(len(self.episode), self.stack)
+        oldest = self.written - reach
+        self.episode = [*self.episode, frame]
+        self.written += 1
+        self.transitions.append(
+            {
+                "observation": observation,
+                "action": action,
+                "reward": reward,
+                "terminated": terminated,
+                "next": self.stacked(self.episode),
+                "oldest": oldest,
+            }
+        )
+
+    def held(self) -> list[dict]:
+        return [t for t in self.transitions if t["oldest"] >= self.written - self.slots]
+
+
+def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator, operations: int) -> None:
+    """Random pushes, terminations, truncations and cuts, into both."""
+    shape = lanes[0].shape
+    for lane_id, lane in enumerate(lanes):
+        frame = rng.integers(0, 256, shape, np.uint8)
+        lane.begin(frame)
+        replay.begin(lane_id, frame)
+    for _ in range(operations):
+        lane_id = int(rng.integers(len(lanes)))
+        event = rng.random()
+        frame = rng.integers(0, 256, shape, np.uint8)
+        action, reward, terminated = int(rng.integers(18)), float(rng.normal()), bool(event < 0.1)
+        lanes[lane_id].add(action, reward, terminated, frame)
+        replay.add(lane_id, action, reward, terminated, frame)
+        if event < 0.2:  # terminated or truncated, or the task was left
+            first = rng.integers(0, 256, shape, np.uint8)
+            lanes[lane_id].begin(first)
+            replay.begin(lane_id, first)
+
+
+def compare(replay: FrameReplay, lanes: list[NaiveLane]) -> None:
+    replay.check_valid()
+    batch = replay.gather(replay.valid_slots())
+    ours = {
+        (o.tobytes(), int(a), float(r), bool(t), n.tobytes())
+        for o, a, r, t, n in zip(
+            batch.observations, batch.actions, batch.rewards, batch.terminated, batch.next_observations, strict=True
+        )
+    }
+    naive = {
+        (t["observation"].tobytes(), t["action"], float(np.float32(t["reward"])), t["terminated"], t["next"].tobytes())
+        for lane in lanes
+        for t in lane.held()
+    }
+    assert ours == naive
+    assert len(replay) == sum(len(lane.held()) for lane in lanes)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    num_lanes=st.integers(1, 3),
+    slots=st.integers(6, 40),
+    stack=st.integers(1, 5),
+    operations=st.integers(0, 300),
+    seed=st.integers(0, 2**31),
+)
+def test_equals_naive_list(num_lanes: int, slots: int, stack: int, operations: int, seed: int) -> None:
+    shape = (2, 3)
+    replay = FrameReplay(slots * num_lanes, num_lanes, shape, np.uint8, stack)
+    lanes = [NaiveLane(slots, stack, shape) for _ in range(num_lanes)]
+    drive(replay, lanes, np.random.default_rng(seed), operations)
+    compare(replay, lanes)
+
+
+@pytest.mark.parametrize("slots", [700, SEGMENT_SLOTS, 2500])
+def test_stored_and_loaded_is_the_same(slots: int) -> None:
+    """Segments of an older moment plus those written since give the ring back, also after it went round."""
+    shape = (1, 2)
+    replay = FrameReplay(2 * slots, 2, shape, np.uint8, 4)
+    lanes = [NaiveLane(slots, 4, shape) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    stored: dict[Segment, np.ndarray] = {}
+    for operations in (900, 3000, 2600):
+        drive(replay, lanes, rng, operations)
+        for segment in replay.segments():
+            if segment not in stored or not segment.complete:
+                stored[segment] = replay.read_segment(segment).copy()
+    copy = FrameReplay(2 * slots, 2, shape, np.uint8, 4)
+    copy.load_state_dict(replay.state_dict())
+    for segment in replay.segments():
+        copy.load_segment(segment, stored[segment])
+    compare(copy, lanes)
+    one, two = (r.sample(64, np.random.default_rng(3)) for r in (replay, copy))
+    assert np.array_equal(one.observations, two.observations)
+    assert np.array_equal(one.next_observations, two.next_observations)
+
+
+def test_sampling_is_uniform_and_seeded() -> None:
+    replay = FrameReplay(40, 2, (1,), np.float32, 2)
+    lanes = [NaiveLane(20, 2, (1,)) for _ in range(2)]
+    for lane in range(2):
+        replay.begin(lane, np.zeros(1, np.float32))
+        for action in range(10 if lane else 15):
+            replay.add(lane, action, 0.0, False, np.ones(1, np.float32))
+    del lanes
+    slots, draws = replay.valid_slots(), 50_000
+    rng = np.random.default_rng(0)
+    counts = np.zeros(40)
+    original = replay.gather
+    replay.gather = lambda chosen: np.add.at(counts, chosen, 1)  # type: ignore[method-assign,assignment,return-value]
+    replay.sample(draws, rng)
+    replay.gather = original  # type: ignore[method-assign]
+    expected = draws / len(slots)
+    chi2 = float(((counts[slots] - expected) ** 2 / expected).sum())
+    assert counts.sum() == draws
+    assert chi2 < 60, "24 degrees of freedom: 60 is beyond the 99.99th percentile"
+
+
+def test_nothing_to_sample() -> None:
+    with pytest.raises(ValueError, match="no transition"):
+        FrameReplay(10, 1, (1,), np.float32, 1).sample(2, np.random.default_rng(0))

@@ -1,0 +1,160 @@
+"""Switching policies: bounds that all keep, and each criterion on records made by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from switchmt_snn.config import POLICIES, SwitchingConfig
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.switching import (
+    EpisodeRecord,
+    Stay,
+    SwitchingPolicy,
+    SwitchTo,
+    relative_change,
+    slope_test,
+)
+from tests.conftest import SameObservationEnvironment, small_config, vector_suite
+
+
+def record(episode: int, steps: int, theta: Tensor, updates: int = 0, value: float = 0.0, task: int = 0) -> EpisodeRecord:
+    return EpisodeRecord(task, episode, steps, updates, value, lambda: theta.clone())
+
+
+def play(policy: SwitchingPolicy, lengths: list[int], drift: float, values: list[float]) -> list[tuple[int, int, bool]]:
+    """Feed episodes; returns (steps and episodes in the visit, left?) for each decision."""
+    theta, steps, episodes, log = torch.ones(4), 0, 0, []
+    for number, (length, value) in enumerate(zip(lengths, values, strict=True)):
+        steps, episodes = steps + length, episodes + 1
+        theta = theta * (1 + drift)
+        decision = policy.end_of_episode(record(episodes, steps, theta, updates=10 * number, value=value))
+        log.append((steps, episodes, isinstance(decision, SwitchTo)))
+        if isinstance(decision, SwitchTo):
+            steps = episodes = 0
+    return log
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    policy=st.sampled_from(POLICIES),
+    lengths=st.lists(st.integers(1, 60), min_size=1, max_size=80),
+    drift=st.floats(0.0, 0.2),
+    seed=st.integers(0, 1000),
+    min_steps=st.integers(0, 200),
+    extra=st.integers(1, 300),
+    min_episodes=st.integers(0, 10),
+)
+def test_bounds_and_determinism(policy, lengths, drift, seed, min_steps, extra, min_episodes) -> None:
+    """Never leaves before min_stay, always at the first episode end past max_stay; same records, same decisions."""
+    config = SwitchingConfig(
+        policy=policy,
+        visit_episodes=3,
+        visit_steps=50,
+        window_episodes=2,
+        plateau_window_episodes=4,
+        min_stay_steps=min_steps,
+        min_stay_episodes=min_episodes,
+        max_stay_steps=min_steps + extra,
+    )
+    values = list(np.random.default_rng(seed).normal(size=len(lengths)))
+    logs = [play(SwitchingPolicy(config, 3), lengths, drift, values) for _ in range(2)]
+    assert logs[0] == logs[1]
+    for steps, episodes, left in logs[0]:
+        past = steps >= min_steps + extra
+        if left and not past:
+            assert steps >= min_steps
+            assert episodes >= min_episodes
+        if past:
+            assert left
+
+
+def test_every_policy_can_leave_and_one_task_never_does() -> None:
+    for name in POLICIES:
+        config = SwitchingConfig(
+            policy=name,
+            visit_episodes=3,
+            visit_steps=20,
+            window_episodes=2,
+            plateau_window_episodes=4,
+        )
+        # The parameters move fast at first and then hardly, the returns are flat.
+        theta, outcomes = torch.ones(4), {1: [], 3: []}
+        for num_tasks, decisions in outcomes.items():
+            policy = SwitchingPolicy(config, num_tasks)
+            theta = torch.ones(4)
+            for episode in range(1, 13):
+                theta = theta * (1.5 if episode < 4 else 1.001)
+                decisions.append(policy.end_of_episode(record(episode, 10 * episode, theta, 10 * episode)))
+        assert any(isinstance(d, SwitchTo) and d.task == 1 for d in outcomes[3]), name
+        assert all(isinstance(d, Stay) for d in outcomes[1]), name
+
+
+def test_eq_3_spans_k_episodes() -> None:
+    """K = 2: three snapshots; the first decision with a number comes at the third episode end."""
+    policy = SwitchingPolicy(SwitchingConfig(policy="parameter_change", window_episodes=2), 2)
+    thetas = [torch.tensor([3.0, 4.0]), torch.tensor([3.0, 4.0]), torch.tensor([3.0, 4.0 + 1.0])]
+    first, second, third = (policy.end_of_episode(record(n, n, theta)) for n, theta in enumerate(thetas, start=1))
+    assert "parameter_change" not in first.measured
+    assert "parameter_change" not in second.measured
+    assert third.measured["parameter_change"] == pytest.approx(1 / 5)  # |(0, 1)| / |(3, 4)|
+    assert isinstance(third, Stay)
+    fourth = policy.end_of_episode(record(4, 4, torch.tensor([3.0, 4.0 + 0.4])))
+    # now against the second snapshot (3, 4): 0.4 / 5 = 8 % < 10 %
+    assert fourth.measured["parameter_change"] == pytest.approx(0.08)
+    assert fourth == SwitchTo(1, "parameter_change", fourth.measured)
+    fifth = policy.end_of_episode(record(1, 1, torch.ones(2)))
+    assert "parameter_change" not in fifth.measured, "H_i was emptied"
+
+
+def test_snapshots_are_copies() -> None:
+    """The released script's snapshot aliases the live parameters, so its change is always 0. One update must show."""
+    from switchmt_snn.learning.training import Training
+
+    suite = vector_suite(SameObservationEnvironment, 3)  # type: ignore[arg-type]
+    training = Training(small_config(total_steps=30), suite, torch.device("cpu"))
+    learner: Learner = training.learner
+    for event in training.events():
+        del event
+    before = learner.parameters()
+    kept = before.clone()
+    learner.update(training.replays[0].sample(8, np.random.default_rng(0)), 0)
+    assert torch.equal(before, kept), "the snapshot moved with the network"
+    assert relative_change(before, learner.parameters()) > 0
+
+
+def test_slope_test_equals_least_squares() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        values = list(rng.normal(size=12) + 0.1 * np.arange(12))
+        (slope, _), covariance = np.polyfit(np.arange(12), values, 1, cov="unscaled")
+        residual = np.asarray(values) - np.polyval(np.polyfit(np.arange(12), values, 1), np.arange(12))
+        error = math.sqrt((residual**2).sum() / 10 * covariance[0, 0])
+        ours, t = slope_test(values)
+        assert ours == pytest.approx(slope)
+        assert t == pytest.approx(slope / error)
+    assert slope_test([2.0] * 5) == (0.0, 0.0)
+    assert slope_test([1.0, 2.0, 3.0, 4.0])[1] == math.inf
+
+
+def test_reward_plateau_needs_patience() -> None:
+    config = SwitchingConfig(policy="reward_plateau", plateau_window_episodes=4, plateau_patience_episodes=3)
+    policy = SwitchingPolicy(config, 2)
+    rising = [policy.end_of_episode(record(n, n, torch.ones(1), value=float(n))) for n in range(1, 9)]
+    assert all(isinstance(d, Stay) for d in rising)
+    flat = [policy.end_of_episode(record(n, n, torch.ones(1), value=8.0)) for n in range(9, 20)]
+    left = next(index for index, d in enumerate(flat) if isinstance(d, SwitchTo))
+    assert flat[left].measured["flat_episodes"] == 3
+    assert [d.measured["flat_episodes"] for d in flat[left - 2 : left]] == [1, 2]
+
+
+def test_unresolved_policy_is_refused() -> None:
+    with pytest.raises(ConfigError, match="expected one of"):
+        SwitchingPolicy(SwitchingConfig(policy="auto"), 2)
