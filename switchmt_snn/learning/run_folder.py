@@ -12,6 +12,7 @@ import io
 import json
 import os
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Iterable
@@ -288,7 +289,7 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
             versions[package] = None
     return {
         "program": "switchmt-snn",
-        "command": " ".join(sys.argv),
+        "command": _command(),
         "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -300,6 +301,13 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
         "versions": versions,
         "rom_sha256": _rom_sums(config),
     }
+
+
+def _command() -> str:
+    """The command line without the folder in which the program lies; ``python`` for a library call."""
+    program = Path(sys.argv[0]).name
+    ours = program in ("switchmt-snn", "__main__.py")
+    return shlex.join(["switchmt-snn", *sys.argv[1:]]) if ours else f"python {program}"
 
 
 def _processor() -> str:

@@ -128,49 +128,51 @@ class SpikingLayer(nn.Module):
 
 
 class _FusedLeaky(torch.autograd.Function):
-    """T steps of ``snntorch.Leaky`` with fixed beta and threshold; saves only the membranes."""
+    """T steps of ``snntorch.Leaky`` with fixed beta and threshold.
+
+    Spikes are kept as floats and resets written as ``u - u * s``, which is exactly 0 or u: arithmetic between floats
+    and booleans, and ``torch.where``, are up to 30 times slower on a CPU.
+    """
 
     @staticmethod
     def forward(
         ctx: Any, current: Tensor, membrane: Tensor, beta: float, threshold: float, zero: bool, spike_grad: Surrogate
     ) -> tuple[Tensor, Tensor]:
         membranes = torch.empty_like(current, memory_format=torch.contiguous_format)
-        nothing = current.new_zeros(())
-        previous, fired = membrane, membrane > threshold
+        spikes = torch.empty_like(membranes)
+        previous, fired = membrane, torch.gt(membrane, threshold).to(current.dtype)
         for t in range(current.shape[0]):
             u = membranes[t]
-            # torch.where keeps one dtype throughout: several times faster than arithmetic on the boolean spikes.
             if zero:
-                torch.where(fired, nothing, previous, out=u)
+                torch.addcmul(previous, previous, fired, value=-1.0, out=u)
                 if beta != 1.0:
                     u.mul_(beta)
                 u.add_(current[t])
             else:
                 torch.add(previous if beta == 1.0 else previous * beta, current[t], out=u)
-                torch.where(fired, u - threshold, u, out=u)
-            previous, fired = u, u > threshold
-        ctx.save_for_backward(membranes, membrane)
+                u.sub_(fired, alpha=threshold)
+            previous, fired = u, torch.gt(u, threshold, out=spikes[t])
+        ctx.save_for_backward(membranes, spikes, membrane)
         ctx.beta, ctx.threshold, ctx.zero, ctx.spike_grad = beta, threshold, zero, spike_grad
-        return (membranes > threshold).to(current.dtype), membranes[-1].clone()
+        return spikes, membranes[-1].clone()
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         grad_spikes, grad_last = gradients
-        membranes, initial = ctx.saved_tensors
+        membranes, spikes, initial = ctx.saved_tensors
         # dS/dU from the surrogate itself: any element-wise surrogate of snnTorch works, with its own backward.
         with torch.enable_grad():
             shifted = (membranes - ctx.threshold).requires_grad_()
             (grad,) = torch.autograd.grad(ctx.spike_grad(shifted), shifted, grad_spikes)
         grad[-1] += grad_last
-        nothing = grad.new_zeros(())
         for t in range(membranes.shape[0] - 2, -1, -1):
             carried = grad[t + 1] * ctx.beta if ctx.beta != 1.0 else grad[t + 1]
-            grad[t] += torch.where(membranes[t] > ctx.threshold, nothing, carried) if ctx.zero else carried
+            grad[t] += torch.addcmul(carried, carried, spikes[t], value=-1.0) if ctx.zero else carried
         grad_initial = None
         if ctx.needs_input_grad[1]:
             grad_initial = grad[0] * ctx.beta
             if ctx.zero:
-                grad_initial = torch.where(initial > ctx.threshold, nothing, grad_initial)
+                grad_initial = grad_initial * (initial <= ctx.threshold)
         return grad, grad_initial, None, None, None, None
 
 
