@@ -275,8 +275,11 @@ def _parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
 
 
 def _one_line(boxed: str, command: str) -> str:
-    lines = [line.strip("│ ").strip() for line in boxed.splitlines() if line.startswith("│")]
-    text = " ".join(line for line in lines if line and not set(line) <= {"─"})
+    """What tyro says in a box (of lines in a UTF-8 terminal, of spaces elsewhere), without title, rules and advice."""
+    lines = [line.strip("│ ") for line in boxed.splitlines() if line.strip() and line[0] not in "╭╰"]
+    if "│" not in boxed:
+        lines = lines[1:]
+    text = " ".join(line for line in lines if not set(line) <= set("─-"))
     text = text.split("For full helptext")[0].split("Argument helptext")[0].strip().rstrip(".")
     return f"{text}; see switchmt-snn {command} --help"
 

@@ -93,7 +93,7 @@ class NetworkConfig:
     """The spiking Q-network (or its ANN twin): method, trunk, neurons, time, encoding, dendrites, normalisation."""
 
     method: Method = "SwitchMT"
-    """One of the paper's seven methods: fixes spiking or ReLU, dueling or not, dendrites or not."""
+    """DQN, DSQN, DQN_D, DSQN_D, MTSpark_AD, MTSpark_ADD or SwitchMT: fixes neurons, dueling structure and dendrites."""
     trunk: Literal["auto", "nature", "minatar", "mlp"] = "auto"
     """Feature layers: three convolutions (84x84), one (10x10), or one linear layer; auto follows tasks.suite."""
     hidden_units: int | None = None
@@ -258,7 +258,8 @@ class SwitchingConfig:
     """When training leaves a task (paper, Algorithm 1 and Eq. 3; docs/algorithm.md, Switching policies)."""
 
     policy: Literal["auto"] | Policy = "auto"
-    """The switching policy; auto takes the method's own (SwitchMT: parameter_change, all others: fixed_episodes)."""
+    """fixed_episodes, fixed_steps, interleave, parameter_change (Eq. 3), parameter_change_per_update, reward_plateau or
+    parameter_and_reward; auto takes the method's own (SwitchMT: parameter_change, all others: fixed_episodes)."""
     visit_episodes: int = 25
     """fixed_episodes: episodes per visit."""
     visit_steps: int = 10_000

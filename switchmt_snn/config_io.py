@@ -168,7 +168,7 @@ def field_documentation() -> list[tuple[str, str, list[tuple[str, str, str, str]
             if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
                 text = ""
                 if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                    text = str(after.value.value)
+                    text = " ".join(str(after.value.value).split())
                 texts[statement.target.id] = (ast.unparse(statement.annotation), text)
         rows = []
         for item in dataclasses.fields(cls):

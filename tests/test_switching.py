@@ -25,7 +25,9 @@ from switchmt_snn.learning.switching import (
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite
 
 
-def record(episode: int, steps: int, theta: Tensor, updates: int = 0, value: float = 0.0, task: int = 0) -> EpisodeRecord:
+def record(
+    episode: int, steps: int, theta: Tensor, updates: int = 0, value: float = 0.0, task: int = 0
+) -> EpisodeRecord:
     return EpisodeRecord(task, episode, steps, updates, value, lambda: theta.clone())
 
 

@@ -158,9 +158,7 @@ def test_state_dict_continues_exactly(policy: str) -> None:
     for event in events:
         log.append(event)
         if isinstance(event, Stepped) and event.step in (3, 33, 150, 271):
-            frames = [
-                {(s.lane, s.number): r.read_segment(s).copy() for s in r.segments()} for r in whole.replays
-            ]
+            frames = [{(s.lane, s.number): r.read_segment(s).copy() for s in r.segments()} for r in whole.replays]
             import copy
 
             states[event.step] = (copy.deepcopy(whole.state_dict()), frames, len(log))
@@ -237,7 +235,7 @@ def test_every_method_learns_the_identity_task(method: str) -> None:
 
 def test_a_loss_that_is_not_finite_stops_the_run() -> None:
     training = counting(small_config(learning={"learning_rate": 1e30, "clip_rewards": False}))
-    with pytest.raises(TrainingFailed, match="not finite .* try a lower learning.learning_rate"):
+    with pytest.raises(TrainingFailed, match=r"not finite .* try a lower learning\.learning_rate"):
         run(training)
 
 

@@ -116,7 +116,8 @@ class CheckpointStore:
             write_atomically(folder / name, content)
         sums = {name: sha256(content) for name, content in files.items()}
         manifest = {"format": FORMAT, "program": "switchmt-snn", **facts, "files": sums}
-        write_atomically(folder / "manifest.json", json.dumps(manifest, indent=1).encode())
+        sealed = {**manifest, "seal": _seal(manifest)}
+        write_atomically(folder / "manifest.json", json.dumps(sealed, indent=1).encode())
 
     def _store_segments(self, task: int, replay: FrameReplay) -> Iterator[dict[str, Any]]:
         for segment in replay.segments():
@@ -232,11 +233,18 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         manifest = _read_json((path / "manifest.json").read_bytes(), "manifest.json")
     except OSError as error:
         raise CheckpointError("manifest.json cannot be read") from error
-    if not isinstance(manifest, dict) or "files" not in manifest or not isinstance(manifest.get("format"), int):
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("format"), int):
         raise CheckpointError("manifest.json is not a manifest")
     if manifest["format"] > FORMAT:
         raise CheckpointError(f"format {manifest['format']} is newer than {FORMAT}; update switchmt-snn")
+    if manifest.pop("seal", None) != _seal(manifest):
+        raise CheckpointError("manifest.json has another checksum")
     return manifest
+
+
+def _seal(manifest: dict[str, Any]) -> str:
+    """Checksum of a manifest's own content."""
+    return sha256(json.dumps(manifest, sort_keys=True).encode())
 
 
 def _read_json(content: bytes, name: str) -> Any:

@@ -143,6 +143,7 @@ class _Driver:
         self.logs: RunLogs | None = None
 
     def run(self) -> RunResult:
+        """Continue or begin, to the budget or to a stop."""
         training, config = self.training, self.config
         log_sizes, resumed_at, notes = self._restore()
         if resumed_at is not None and training.steps >= config.total_steps:

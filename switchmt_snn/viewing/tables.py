@@ -80,7 +80,9 @@ def _score_cells(row: TaskScore) -> list[str]:
 
 def methods_table(methods: dict[str, MethodDescription]) -> Table:
     """One row per method."""
-    table = _table("Methods under this config", "ops: dense synaptic operations per decision, in millions; T: simulation steps")
+    table = _table(
+        "Methods under this config", "ops: dense synaptic operations per decision, in millions; T: simulation steps"
+    )
     _add_columns(table, ("method",), ("parameters", "neurons", "T", "ops (M)", "GiB"))
     table.add_column("switching", no_wrap=True)
     for method in methods.values():
