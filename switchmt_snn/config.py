@@ -374,6 +374,8 @@ class ExperimentConfig:
     recording: RecordingConfig = field(default_factory=RecordingConfig)
 
     def __post_init__(self) -> None:
+        plain = bool(self.name) and all(letter.isalnum() or letter in "-_." for letter in self.name)
+        _require(plain, "name", self.name, "letters, digits, '-', '_' and '.': it becomes part of a folder's name")
         _require(self.seed >= 0, "seed", self.seed, "at least 0")
         _require(self.total_steps >= 1, "total_steps", self.total_steps, "at least 1")
         _require(self.threads is None or self.threads >= 1, "threads", self.threads, "at least 1 or null")

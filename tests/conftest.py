@@ -22,7 +22,7 @@ def _one_thread() -> None:
 
 
 def small_config(**changes: dict[str, Any] | Any) -> ExperimentConfig:
-    """A resolved config of seconds: mlp on vectors, tiny batch and replay; ``changes`` go over it section by section."""
+    """A resolved config of seconds: mlp on vectors, tiny replay; ``changes`` go over it section by section."""
     base: dict[str, Any] = {
         "name": "test",
         "seed": 7,

@@ -218,5 +218,18 @@ def test_gym_tasks_from_a_file(tmp_path: Path, capsys) -> None:
     assert "Acrobot-v1" in out
 
 
+def test_tensorboard_is_one_more_view(tmp_path: Path, capsys) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = tmp_path / "run"
+    flags = ["--tasks.suite", "gym", "--tasks.names", "CartPole-v1", "--recording.tensorboard"]
+    code, _, err = call(capsys, "train", "--run", str(run), *SMALL, *flags)
+    assert code == 0, err
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    returns = [(point.step, point.value) for point in events.Scalars("return/CartPole-v1")]
+    rows = list(csv.DictReader((run / "episodes.csv").read_text().splitlines()))
+    assert returns == [(int(row["step"]), float(row["return"])) for row in rows]
+
+
 def test_default_config_has_no_private_fields() -> None:
     assert all(not name.startswith("_") for name in vars(ExperimentConfig()))

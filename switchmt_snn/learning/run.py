@@ -96,6 +96,7 @@ def train(
         check_same_config(stored, config, folder.path)
     suite = make_suite(config.tasks)
     device = select_device(config.device)
+    torch.backends.cudnn.deterministic = True  # exact resume; benchmark mode would choose kernels by the clock
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     require_memory(describe_method(config, suite).memory, config)
@@ -146,7 +147,8 @@ class _Driver:
         """Continue or begin, to the budget or to a stop."""
         training, config = self.training, self.config
         log_sizes, resumed_at, notes = self._restore()
-        if resumed_at is not None and training.steps >= config.total_steps:
+        finished = resumed_at is not None and training.steps >= config.total_steps
+        if finished and self.folder.has_evaluation(training.steps):
             return RunResult(self.folder.path, "already_finished", training.steps, None)
         try:
             return self._run(log_sizes, resumed_at, notes)

@@ -175,7 +175,7 @@ class RunFolder:
         folder = self.path / "evaluations"
         protocol = evaluation.protocol
         tasks = {row.task for row in evaluation.tasks}
-        stem = f"step-{evaluation.step:012d}_{'+'.join(sorted(tasks))}_n{protocol.episodes}_seed{protocol.seed}"
+        stem = f"{_evaluation_stem(evaluation.step)}_{'+'.join(sorted(tasks))}_n{protocol.episodes}_seed{protocol.seed}"
         rows = [asdict(episode) for episode in evaluation.episodes]
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
@@ -188,6 +188,10 @@ class RunFolder:
         except OSError as error:
             raise RunFolderError(_unwritable(folder, error)) from error
         return folder / f"{stem}.csv"
+
+    def has_evaluation(self, step: int) -> bool:
+        """Whether the weights of this step were evaluated."""
+        return any((self.path / "evaluations").glob(f"{_evaluation_stem(step)}_*.json"))
 
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""
@@ -301,6 +305,10 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
         "versions": versions,
         "rom_sha256": _rom_sums(config),
     }
+
+
+def _evaluation_stem(step: int) -> str:
+    return f"step-{step:012d}"
 
 
 def _command() -> str:
