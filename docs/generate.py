@@ -104,7 +104,7 @@ def minatar_page() -> str:
         "",
         f"SwitchMT (spiking, dueling, shared dendrites, Eq. 3 switching) learns {', '.join(games)}",
         f"in one network, {total:,} agent steps in all (`configs/minatar.yaml`). Beside it: an ANN DQN of the same",
-        f"layer sizes on *one* game alone, with the steps ({total // len(games):,}) and updates that one game gets there.",
+        f"layer sizes on *one* game alone, with the steps ({total // len(games):,}) and updates that it gets there.",
         "",
         f"Scores: raw returns of {protocol['episodes']} episodes, epsilon {protocol['epsilon']}, sticky actions "
         f"{protocol['sticky_action_probability']}, seed {protocol['seed']}; mean ± 95 % confidence half-width.",

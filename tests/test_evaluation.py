@@ -21,7 +21,8 @@ from switchmt_snn.learning.evaluation import (
 )
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.suite import Reference, make_suite
+from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.suite import Reference
 from switchmt_snn.viewing.tables import published_rows
 from tests.conftest import CountingEnvironment, small_config, vector_suite
 

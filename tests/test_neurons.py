@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args, get_type_hints
 
 import pytest
 import snntorch
@@ -13,16 +14,7 @@ from hypothesis import strategies as st
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.spiking.neurons import ReLULayer, SpikingLayer
 
-SURROGATES = (
-    "atan",
-    "sigmoid",
-    "fast_sigmoid",
-    "triangular",
-    "straight_through_estimator",
-    "spike_rate_escape",
-    "SFS",
-    "heaviside",
-)
+SURROGATES = tuple(name for name in get_args(get_type_hints(NetworkConfig)["surrogate"]) if name != "SSO")
 
 
 def run(config: NetworkConfig, current: list[float]) -> tuple[list[float], float]:

@@ -32,7 +32,7 @@ from switchmt_snn.learning.run_folder import (
 )
 from switchmt_snn.learning.training import Training, observation_spec
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.suite import make_suite
+from switchmt_snn.tasks.make import make_suite
 
 BEST_WINDOW_EPISODES = 20
 """The best checkpoint has the largest mean rise of the newest 20 training returns over a task's first 20."""

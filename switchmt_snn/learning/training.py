@@ -21,8 +21,8 @@ from switchmt_snn.learning.replay import FrameReplay
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
 from switchmt_snn.spiking.network import ObservationSpec, build_network
-from switchmt_snn.tasks.play import Play, PlayedStep, episode_seed
-from switchmt_snn.tasks.suite import TaskSuite
+from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.suite import TaskSuite, VectorStep
 
 HEALTH_BATCH = 32
 
@@ -147,7 +147,7 @@ class Training(Stateful):
             actions = np.where(explore, actions, greedy)
         return actions
 
-    def _remember(self, play: Play, actions: npt.NDArray[np.int64], played: PlayedStep) -> None:
+    def _remember(self, play: Play, actions: npt.NDArray[np.int64], played: VectorStep) -> None:
         replay = self.replays[self.task]
         for env in range(self.num_envs):
             replay.add(
@@ -168,7 +168,7 @@ class Training(Stateful):
                 if not self.is_warming_up(task):
                     self.learner.update(self.replays[task].sample(learning.batch_size, self.sample_rng), task)
 
-    def _end_episodes(self, play: Play, played: PlayedStep, epsilon: float) -> Iterator[Event]:
+    def _end_episodes(self, play: Play, played: VectorStep, epsilon: float) -> Iterator[Event]:
         """Report ended episodes, ask the policy, and start what comes next (Algorithm 1, lines 13-20)."""
         task = self.task
         switch: SwitchTo | None = None

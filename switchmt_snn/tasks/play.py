@@ -8,33 +8,17 @@ plays them again.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.tasks.suite import Frames, TaskSuite
+from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
 
 
 def episode_seed(root: int, task: int, episode: int) -> int:
     """Seed of an episode, from the run's root seed, the task index and the episode's number within the task."""
     return int(np.random.SeedSequence([root, task, episode]).generate_state(1)[0] & 0x7FFF_FFFF)
-
-
-@dataclass(frozen=True)
-class PlayedStep:
-    """One step of all copies: the frames after it, raw rewards, and which episodes ended."""
-
-    frames: Frames
-    rewards: npt.NDArray[np.float64]
-    terminated: npt.NDArray[np.bool_]
-    truncated: npt.NDArray[np.bool_]
-
-    @property
-    def ended(self) -> npt.NDArray[np.int64]:
-        """Copies whose episode ended, terminated or truncated."""
-        return np.flatnonzero(self.terminated | self.truncated)
 
 
 class Play:
@@ -70,7 +54,7 @@ class Play:
             self._actions[env_id] = []
         return frames
 
-    def step(self, actions: npt.NDArray[np.int64]) -> PlayedStep:
+    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
         """Play one step in every copy. Ended copies keep their last observation until :meth:`begin`."""
         result = self._environment.step(actions)
         c = self._channels
@@ -80,7 +64,7 @@ class Play:
         self.lengths_steps += 1
         for env_id, action in enumerate(actions.tolist()):
             self._actions[env_id].append(action)
-        return PlayedStep(result.frames, result.rewards, result.terminated, result.truncated)
+        return result
 
     def close(self) -> None:
         """Free the environments."""

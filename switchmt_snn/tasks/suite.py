@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import TaskError, did_you_mean
 
 Frames = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
@@ -24,6 +23,11 @@ class VectorStep:
     rewards: npt.NDArray[np.float64]
     terminated: npt.NDArray[np.bool_]
     truncated: npt.NDArray[np.bool_]
+
+    @property
+    def ended(self) -> npt.NDArray[np.int64]:
+        """Copies whose episode ended, terminated or truncated."""
+        return np.flatnonzero(self.terminated | self.truncated)
 
 
 class TaskEnvironment(Protocol):
@@ -101,23 +105,3 @@ class TaskSuite:
         if name not in self.names:
             raise TaskError(f"unknown task {name!r}{did_you_mean(name, self.names)}")
         return self.names.index(name)
-
-
-def make_suite(config: TasksConfig) -> TaskSuite:
-    """Build the suite that a config names.
-
-    Raises:
-        TaskError: a game or environment id is unknown, or its spaces do not fit a Q-network.
-        MissingExtraError: the suite needs an optional package.
-    """
-    if config.suite == "atari":
-        from switchmt_snn.tasks.atari import make_atari_suite
-
-        return make_atari_suite(config)
-    if config.suite == "minatar":
-        from switchmt_snn.tasks.minatar import make_minatar_suite
-
-        return make_minatar_suite(config)
-    from switchmt_snn.tasks.gym import make_gym_suite
-
-    return make_gym_suite(config)
