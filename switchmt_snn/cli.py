@@ -155,7 +155,7 @@ def _train(argv: list[str]) -> int:
 
 def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> None:
     lines = []
-    if config.name == "quickstart":
+    if config.name == "quickstart" and config.tasks.suite == "atari":
         lines.append(
             "This run shows the machinery; it is far too short to learn Atari. What learns: 'switchmt-snn train "
             "minatar' on a CPU (times and scores in results/minatar/README.md), 'switchmt-snn train paper' on a GPU."

@@ -162,7 +162,7 @@ def _distance(event: SwitchDecided) -> str:
     """How far the last decision was from a switch, in the policy's own numbers."""
     decision, measured = event.decision, event.decision.measured
     if isinstance(decision, SwitchTo):
-        return f"switched ({decision.reason})"
+        return f"came by {decision.reason}"
     pairs = (
         ("parameter_change", "change_threshold", "change {:.1%} of {:.1%}"),
         ("episodes_in_visit", "visit_episodes", "episode {:.0f} of {:.0f}"),
