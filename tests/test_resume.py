@@ -198,8 +198,16 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(
     loaded = store.load(training.replays)
     assert loaded.step < 1600
     assert newest.name in loaded.damaged[0]
+    # The run goes on from the older one, comes to the same step again, and saves it whole.
+    training.load_state_dict(loaded.state)
+    for _ in training.events():
+        pass
+    store.save(1600, training.state_dict(), training.replays, loaded.log_sizes)
+    again = Training(settings, training.suite, torch.device("cpu"))
+    assert CheckpointStore(folder / "checkpoints").load(again.replays).damaged == ()
+    assert content(folder)["files"] == content(whole)["files"]
     for path in store.paths():
-        damage(path / "state.json", "truncated") if (path / "state.json").exists() else None
+        damage(path / "state.json", "truncated")
     with pytest.raises(CheckpointError, match="no whole checkpoint"):
         store.load(training.replays)
 

@@ -68,6 +68,8 @@ class CheckpointStore:
         self._replay_folder.mkdir(parents=True, exist_ok=True)
         segments = [entry for task, replay in enumerate(replays) for entry in self._store_segments(task, replay)]
         final = self.folder / _name(step)
+        if final.is_dir() and self._is_whole(final):
+            return final  # saved already at this very step, and a step has one state
         temporary = self.folder / f".{final.name}.tmp"
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
@@ -127,7 +129,7 @@ class CheckpointStore:
                 content = zstandard.compress(np.ascontiguousarray(replay.read_segment(segment)).tobytes(), 3)
                 digest = sha256(content)
                 path = self._replay_folder / f"{digest}.zst"
-                if not path.exists():
+                if not path.exists() or sha256(path.read_bytes()) != digest:  # absent, or damaged
                     write_atomically(path, content)
                 entry = {"task": task, "lane": segment.lane, "number": segment.number, "sha256": digest}
                 if segment.complete:
@@ -145,7 +147,7 @@ class CheckpointStore:
                 used |= {entry["sha256"] for entry in _read_manifest(path)["segments"]}
             except CheckpointError:
                 return  # a damaged manifest: its segments are unknown, so none is removed
-        for path in self._replay_folder.glob("*.zst"):
+        for path in [*self._replay_folder.glob("*.zst"), *self._replay_folder.glob(".*.tmp")]:
             if path.stem not in used:
                 path.unlink(missing_ok=True)
         current = {key: entry for key, entry in self._stored.items() if entry["sha256"] in used}
@@ -195,6 +197,18 @@ class CheckpointStore:
         keyed = {(entry["task"], entry["lane"], entry["number"]): entry for entry in manifest["segments"]}
         self._stored = {key: entry for key, entry in keyed.items() if key in complete}
         return LoadedCheckpoint(int(manifest["step"]), state, dict(manifest["logs"]), damaged)
+
+    def _is_whole(self, path: Path) -> bool:
+        """Whether a checkpoint and the segments it refers to can be read as they were written."""
+        try:
+            manifest = _read_manifest(path)
+            for name in manifest["files"]:
+                _read_file(path, name, manifest)
+            for entry in manifest["segments"]:
+                self._read_segment(entry)
+        except CheckpointError:
+            return False
+        return True
 
     def _read_segment(self, entry: dict[str, Any]) -> bytes:
         path = self._replay_folder / f"{entry['sha256']}.zst"
