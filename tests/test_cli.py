@@ -218,6 +218,17 @@ def test_gym_tasks_from_a_file(tmp_path: Path, capsys) -> None:
     assert "Acrobot-v1" in out
 
 
+def test_best_weights_are_kept_and_can_be_evaluated(tmp_path: Path, capsys) -> None:
+    run = tmp_path / "run"
+    flags = [word if word != "240" else "900" for word in SMALL]
+    flags += ["--tasks.suite", "gym", "--tasks.names", "CartPole-v1"]
+    assert call(capsys, "train", "--run", str(run), *flags)[0] == 0
+    manifest = json.loads((run / "checkpoints" / "best" / "manifest.json").read_text())
+    code, out, _ = call(capsys, "evaluate", str(run), "--checkpoint", "best", "--episodes", "2", "--json")
+    assert code == 0
+    assert json.loads(out)["step"] == manifest["step"]
+
+
 def test_tensorboard_is_one_more_view(tmp_path: Path, capsys) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
