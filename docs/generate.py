@@ -127,6 +127,11 @@ def minatar_page() -> str:
     lines.append(
         f"**Not reached** on every seed: {', '.join(missed)}." if missed else "Every game is reached on every seed."
     )
+    lines += [
+        "",
+        "The training returns in `episodes.csv` are lower than these: a visit of 1,000 steps gives each of 8 copies",
+        "125 steps, and longer episodes are cut without a row (docs/run_folder.md).",
+    ]
     lines += ["", "## Steps and time", "", "| run | steps by game | updates | minutes |", "|---|---|---|---|"]
     for name in facts:
         metrics = last_metrics(folder / name)

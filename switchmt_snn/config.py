@@ -74,7 +74,7 @@ class TasksConfig:
     full_action_space: bool = True
     """Atari: all 18 actions in every game, so that the tasks share one meaning per output."""
     max_episode_frames: int = 108_000
-    """Atari: an episode is truncated after this many emulator frames (30 minutes of play)."""
+    """Atari and MinAtar: an episode is truncated after this many frames (in Atari 108,000 are 30 minutes of play)."""
 
     def __post_init__(self) -> None:
         _require(len(self.names) > 0, "tasks.names", self.names, "at least one task")
