@@ -112,6 +112,11 @@ def _main(argv: list[str]) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except OSError as error:
+        print(
+            f"switchmt-snn: the system refused ({error}), expected readable files and room on the disk", file=sys.stderr
+        )
+        return 1
 
 
 def _train(argv: list[str]) -> int:
