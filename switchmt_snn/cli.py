@@ -163,7 +163,7 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> No
     if config.name == "quickstart" and config.tasks.suite == "atari":
         lines.append(
             "This run shows the machinery; it is far too short to learn Atari. What learns: 'switchmt-snn train "
-            "minatar' on a CPU (34 minutes where it was measured; scores in results/minatar/README.md, extra: minatar); "
+            "minatar' on a CPU (34 minutes where measured; scores: results/minatar/README.md; extra: minatar); "
             "'switchmt-snn train paper' is meant for a GPU (its time is not measured yet)."
         )
     lines += [
