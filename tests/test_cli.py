@@ -48,6 +48,18 @@ def test_describe_gives_the_seven_counts(capsys) -> None:
         assert sum(layer["parameters"] for layer in facts["layers"]) == facts["trainable_parameters"]
 
 
+def test_describe_shows_the_configs_own_network(capsys) -> None:
+    """An ablation is described as it is, and every method under settings that only some can have."""
+    _, out, _ = call(capsys, "describe", "--network.dendrites", "none", "--json")
+    assert json.loads(out)["methods"]["SwitchMT"]["trainable_parameters"] == TABLE_3["DSQN_D"]
+    flags = ["--network.dendrites", "per_neuron", "--network.encoding", "rate", "--network.k-winners", "50"]
+    code, out, err = call(capsys, "describe", *flags, "--json")
+    assert code == 0, err
+    counts = {name: facts["trainable_parameters"] for name, facts in json.loads(out)["methods"].items()}
+    assert counts["SwitchMT"] == TABLE_3["DSQN_D"] + 2 * 512 * 9
+    assert counts["DQN"] == TABLE_3["DQN"]
+
+
 def test_describe_table_names_every_method(capsys) -> None:
     _, out, _ = call(capsys, "describe", "minatar")
     for method in METHODS:

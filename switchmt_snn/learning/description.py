@@ -64,15 +64,15 @@ def describe(config: ExperimentConfig) -> dict[str, MethodDescription]:
 
 def with_method(config: ExperimentConfig, method: str) -> ExperimentConfig:
     """The resolved config with another method; settings that the method cannot have take its own values."""
+    if method == config.network.method:
+        return resolve(config)
     traits = METHOD_TRAITS[method]
-    network = replace(config.network, method=cast(Any, method), dendrites="auto") if not traits.dendrites else None
-    if network is not None and not traits.spiking:
-        network = replace(network, encoding="direct", readout="mean", k_winners=None)
-    if network is None:
-        kept = config.network.dendrites if config.network.dendrites != "none" else "auto"
-        network = replace(config.network, method=cast(Any, method), dendrites=kept)
-    policy = config.switching.policy if config.network.method == method else "auto"
-    return resolve(replace(config, network=network, switching=replace(config.switching, policy=policy)))
+    keeps = traits.dendrites and config.network.dendrites != "none"
+    changes: dict[str, Any] = {"method": method, "dendrites": config.network.dendrites if keeps else "auto"}
+    if not traits.spiking:
+        changes |= {"encoding": "direct", "readout": "mean", "k_winners": None}
+    network = replace(config.network, **changes)
+    return resolve(replace(config, network=network, switching=replace(config.switching, policy="auto")))
 
 
 def describe_method(config: ExperimentConfig, suite: TaskSuite) -> MethodDescription:

@@ -90,12 +90,6 @@ class FrameReplay:
         """Type of a frame."""
         return self._frames.dtype
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes reserved."""
-        arrays = (self._frames, self._actions, self._rewards, self._terminated, self._age, self._valid)
-        return sum(array.nbytes for array in arrays)
-
     def begin(self, lane: int, frame: npt.NDArray[Any]) -> None:
         """Start an episode in a lane with its first frame; what came before keeps its last frame."""
         self._write(lane, frame, age=0)
