@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.spiking.neurons import ReLULayer, SpikingLayer
+from switchmt_snn.spiking.neurons import ReLULayer, SpikingLayer, make_surrogate, make_surrogate_gradient
 
 SURROGATES = tuple(name for name in get_args(get_type_hints(NetworkConfig)["surrogate"]) if name != "SSO")
 
@@ -65,6 +65,20 @@ def test_fused_equals_snntorch(reset, neuron, beta, threshold, surrogate, timest
     assert torch.equal(fused[1], plain[1])
     torch.testing.assert_close(fused[2], plain[2], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(fused[3], plain[3], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("slope", [None, 0.5, 40.0])
+@pytest.mark.parametrize("name", SURROGATES)
+def test_surrogate_gradients_equal_snntorchs(name: str, slope: float | None) -> None:
+    """Far from the threshold and at it, in place."""
+    x = torch.cat([torch.linspace(-9, 9, 3001), torch.tensor([0.0, 1e-30, -1e-30])]).requires_grad_()
+    weights = torch.randn(len(x))
+    torch.manual_seed(3)
+    (expected,) = torch.autograd.grad(make_surrogate(name, slope)(x), x, weights)
+    torch.manual_seed(3)
+    overwritten = x.detach().clone()
+    make_surrogate_gradient(name, slope)(overwritten, weights)
+    torch.testing.assert_close(overwritten, expected, rtol=2e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("engine", ["fused", "snntorch"])

@@ -14,6 +14,7 @@ U(t) is the membrane *before* the reset that its own spike causes, as in snnTorc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -25,8 +26,10 @@ from torch import Tensor, nn
 from switchmt_snn.config import NetworkConfig
 
 Surrogate = Callable[[Tensor], Tensor]
+SurrogateGradient = Callable[[Tensor, Tensor], Tensor]
+"""``(U - theta, dL/dS) -> dL/dU``, which overwrites the first argument."""
 
-_SIGMOID_SLOPE = 25.0
+_DEFAULT_SLOPE = {"atan": 2.0, "sigmoid": 25.0, "fast_sigmoid": 25.0}
 _SLOPE_ARGUMENT = {
     "atan": "alpha",
     "sigmoid": "slope",
@@ -48,8 +51,31 @@ def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
     surrogate: Surrogate = factory(**arguments)
     if name != "sigmoid":
         return surrogate
-    lowest = -80.0 / arguments.get("slope", _SIGMOID_SLOPE)
+    lowest = -80.0 / arguments.get("slope", _DEFAULT_SLOPE[name])
     return lambda x: surrogate(x.clamp(min=lowest))
+
+
+def make_surrogate_gradient(name: str, slope: float | None = None) -> SurrogateGradient:
+    """Return the backward of :func:`make_surrogate`'s surrogate as a function of its own.
+
+    snnTorch's backward makes temporaries of the membranes' size; the usual surrogates do without, in place. Any other
+    surrogate runs its own backward.
+    """
+    k = slope if slope is not None else _DEFAULT_SLOPE.get(name, 0.0)
+    if name == "atan":  # (k / 2) / (1 + (pi k x / 2)^2)
+        return lambda x, grad: x.mul_(math.pi / 2 * k).square_().add_(1.0).reciprocal_().mul_(k / 2).mul_(grad)
+    if name == "fast_sigmoid":  # 1 / (1 + k |x|)^2
+        return lambda x, grad: x.abs_().mul_(k).add_(1.0).square_().reciprocal_().mul_(grad)
+    if name == "sigmoid":  # k sigmoid(k x) (1 - sigmoid(k x)), even in x: small numbers keep their digits at x <= 0
+        return lambda x, grad: (s := x.abs_().mul_(-k).sigmoid_()).mul_(1.0 - s).mul_(k).mul_(grad)
+    surrogate = make_surrogate(name, slope)
+
+    def own_backward(x: Tensor, grad: Tensor) -> Tensor:
+        with torch.enable_grad():
+            leaf = x.detach().requires_grad_()
+            return x.copy_(torch.autograd.grad(surrogate(leaf), leaf, grad)[0])
+
+    return own_backward
 
 
 class NeuronLayer(Protocol):
@@ -96,6 +122,7 @@ class SpikingLayer(nn.Module):
         # SSO draws random gradients: one draw per step in snn.Leaky, which a single backward over T would change.
         needs_leaky = config.learn_beta or config.learn_threshold or config.surrogate == "SSO"
         self.fused = config.neuron_engine == "fused" and not needs_leaky
+        self.surrogate_gradient = make_surrogate_gradient(config.surrogate, config.surrogate_slope)
 
     def forward(self, current: Tensor, membrane: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Run T steps.
@@ -113,7 +140,7 @@ class SpikingLayer(nn.Module):
             # The two parameters are fixed numbers; reading them as floats keeps the step free of broadcasts.
             beta, threshold = float(self.leaky.beta.clamp(0, 1)), float(self.leaky.threshold)
             fused: tuple[Tensor, Tensor] = _FusedLeaky.apply(  # type: ignore[no-untyped-call]
-                current, membrane, beta, threshold, self.reset == "zero", self.leaky.spike_grad
+                current, membrane, beta, threshold, self.reset == "zero", self.surrogate_gradient
             )
             return fused
         return self._step_by_step(current, membrane)
@@ -136,7 +163,13 @@ class _FusedLeaky(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, current: Tensor, membrane: Tensor, beta: float, threshold: float, zero: bool, spike_grad: Surrogate
+        ctx: Any,
+        current: Tensor,
+        membrane: Tensor,
+        beta: float,
+        threshold: float,
+        zero: bool,
+        surrogate_gradient: SurrogateGradient,
     ) -> tuple[Tensor, Tensor]:
         membranes = torch.empty_like(current, memory_format=torch.contiguous_format)
         spikes = torch.empty_like(membranes)
@@ -153,21 +186,29 @@ class _FusedLeaky(torch.autograd.Function):
                 u.sub_(fired, alpha=threshold)
             previous, fired = u, torch.gt(u, threshold, out=spikes[t])
         ctx.save_for_backward(membranes, spikes, membrane)
-        ctx.beta, ctx.threshold, ctx.zero, ctx.spike_grad = beta, threshold, zero, spike_grad
+        ctx.set_materialize_grads(False)
+        ctx.beta, ctx.threshold, ctx.zero, ctx.surrogate_gradient = beta, threshold, zero, surrogate_gradient
         return spikes, membranes[-1].clone()
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        grad_spikes, grad_last = gradients
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        grad_spikes, grad_last = gradients  # dL/dS, dL/dU(T); None where the output was not used
         membranes, spikes, initial = ctx.saved_tensors
-        # dS/dU from the surrogate itself: any element-wise surrogate of snnTorch works, with its own backward.
-        with torch.enable_grad():
-            shifted = (membranes - ctx.threshold).requires_grad_()
-            (grad,) = torch.autograd.grad(ctx.spike_grad(shifted), shifted, grad_spikes)
-        grad[-1] += grad_last
-        for t in range(membranes.shape[0] - 2, -1, -1):
-            carried = grad[t + 1] * ctx.beta if ctx.beta != 1.0 else grad[t + 1]
-            grad[t] += torch.addcmul(carried, carried, spikes[t], value=-1.0) if ctx.zero else carried
+        grad = torch.empty_like(membranes)  # dL/dU(t), from the last step to the first
+        through = torch.empty_like(initial)  # dL/dU(t+1) dU(t+1)/dU(t)
+        for t in range(membranes.shape[0] - 1, -1, -1):
+            torch.sub(membranes[t], ctx.threshold, out=grad[t])
+            if grad_spikes is None:
+                grad[t].zero_()
+            else:
+                ctx.surrogate_gradient(grad[t], grad_spikes[t])
+            if t + 1 < membranes.shape[0]:
+                after = grad[t + 1]
+                if ctx.zero:
+                    after = torch.addcmul(after, after, spikes[t], value=-1.0, out=through)
+                grad[t].add_(after, alpha=ctx.beta)
+            elif grad_last is not None:
+                grad[t].add_(grad_last)
         grad_initial = None
         if ctx.needs_input_grad[1]:
             grad_initial = grad[0] * ctx.beta
