@@ -102,6 +102,17 @@ def test_steps_episodes_and_updates_add_up() -> None:
     assert due - 2 * -(-21 // 3) <= training.learner.updates < due
 
 
+def test_a_task_that_is_left_pauses_and_goes_on() -> None:
+    """Visits of 4 steps, episodes of 7: each one ends in a later visit than it began in, and none is lost."""
+    training = counting(small_config(tasks={"num_envs": 3}, switching={"max_stay_steps": 12}))
+    ended = [e for e in run(training) if isinstance(e, EpisodeEnded)]
+    assert {e.length_steps for e in ended} == {7}
+    assert {e.episode_return for e in ended} == {28.0}
+    for task in range(2):
+        assert training.episodes_by_task[task] == 3 * (training.steps_by_task[task] // 3 // 7) > 0
+        assert training.starts_by_task[task] - training.episodes_by_task[task] in (0, 3), "only running ones are open"
+
+
 def test_epsilon_counts_the_steps_it_is_told_to() -> None:
     for clock, expected in (("total", 0.1), ("task", 0.19)):
         training = counting(small_config(total_steps=200, learning={"epsilon_clock": clock}))

@@ -27,7 +27,8 @@ from switchmt_snn.errors import CheckpointError
 from switchmt_snn.learning.files import sha256, sync_folder, write_atomically
 from switchmt_snn.learning.replay import FrameReplay, Segment
 
-FORMAT = 1
+FORMAT = 2
+"""Goes up when a saved state gets another shape. 2: paused episodes of every task. Weights are read from any."""
 _STEP_DIGITS = 12
 
 
@@ -180,6 +181,8 @@ class CheckpointStore:
 
     def _load_one(self, path: Path, replays: list[FrameReplay], damaged: tuple[str, ...]) -> LoadedCheckpoint:
         manifest = _read_manifest(path)
+        if manifest["format"] < FORMAT:
+            raise CheckpointError(f"format {manifest['format']} can be evaluated, but only {FORMAT} can be continued")
         model = _read_tensors(path, "model.safetensors", manifest)
         training = _read_tensors(path, "training.safetensors", manifest)
         tree = _read_json(_read_file(path, "state.json", manifest), "state.json")

@@ -7,6 +7,7 @@ The loop is a generator of events. It knows no screen and no file format; whoeve
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -66,7 +67,7 @@ class Training(Stateful):
         "target_clock",
         "metrics_clock",
     )
-    DERIVED = ("config", "suite", "num_envs", "play", "reproducible", "_plays")
+    DERIVED = ("config", "suite", "num_envs", "reproducible", "_plays")
 
     def __init__(self, config: ExperimentConfig, suite: TaskSuite, device: torch.device) -> None:
         """Prepare a run from a resolved config; nothing is played yet."""
@@ -99,9 +100,8 @@ class Training(Stateful):
         self.update_clock = Every(learning.update_every_steps)
         self.target_clock = Every(learning.target_update_every_steps)
         self.metrics_clock = Every(config.recording.metrics_every_steps)
-        self.play: Play | None = None
         self.reproducible = True
-        self._plays: dict[int, Play] = {}
+        self._plays: dict[int, Play] = {}  # made at a task's first visit; a task that is left keeps its episodes
 
     def events(self) -> Iterator[Event]:
         """Run until ``total_steps``; every event carries the step at which it happened.
@@ -109,10 +109,10 @@ class Training(Stateful):
         Raises:
             TrainingFailed: a loss or a parameter is no longer finite.
         """
-        if self.play is None:
+        if self.visit == 0:
             self._enter(self.task)
         while self.steps < self.config.total_steps:
-            play = self._current_play()
+            play = self._play(self.task)
             task, epsilon = self.task, self.epsilon()
             warming_up = self.is_warming_up(task)
             actions = self.select_actions(play, 1.0 if warming_up else epsilon)  # a via epsilon-greedy
@@ -203,39 +203,38 @@ class Training(Stateful):
             yield self._decided(switch)
         if switch is not None:
             self._enter(switch.task)
-        elif len(played.ended):
-            self._begin_episodes(play, played.ended)
+        else:
+            self._begin_episodes()
 
     def _decided(self, decision: Stay | SwitchTo) -> SwitchDecided:
         return SwitchDecided(self.steps, self.task, self.visit, self.episodes_in_visit, self.steps_in_visit, decision)
 
     def _enter(self, task: int) -> None:
-        """Begin a visit; running episodes of the task that is left stay cut where they are."""
+        """Begin a visit; episodes that were running when the task was left go on where they paused."""
         self.visit += 1
         self.task = task
         self.steps_in_visit = 0
         self.episodes_in_visit = 0
-        self.play = self._make_play(task)
-        self._begin_episodes(self.play, np.arange(self.num_envs))
+        self._begin_episodes()
 
-    def _begin_episodes(self, play: Play, env_ids: npt.NDArray[np.int64]) -> None:
-        seeds = []
-        for _ in env_ids:
-            seeds.append(episode_seed(self.config.seed, self.task, self.starts_by_task[self.task]))
-            self.starts_by_task[self.task] += 1
+    def _begin_episodes(self) -> None:
+        """Start an episode in every copy of the current task that has none."""
+        play = self._play(self.task)
+        env_ids = np.flatnonzero(play.over)
+        if len(env_ids) == 0:
+            return
+        first = self.starts_by_task[self.task]
+        numbers = range(first, first + len(env_ids))
+        seeds = [episode_seed(self.config.seed, self.task, number) for number in numbers]
+        self.starts_by_task[self.task] += len(env_ids)
         frames = play.begin(env_ids, np.asarray(seeds, np.int64))
         for env, frame in zip(env_ids, frames, strict=True):
             self.replays[self.task].begin(int(env), frame)
 
-    def _make_play(self, task: int) -> Play:
-        """The environments of a task, made at its first visit and kept."""
+    def _play(self, task: int) -> Play:
         if task not in self._plays:
             self._plays[task] = Play(self.suite, task, self.num_envs)
         return self._plays[task]
-
-    def _current_play(self) -> Play:
-        assert self.play is not None, "events() enters the first task before the first step"
-        return self.play
 
     def measure(self) -> Measured:
         """Means since the last report and the health of every neuron layer on the current task.
@@ -272,15 +271,15 @@ class Training(Stateful):
             )
 
     def state_dict(self) -> dict[str, object]:
-        """The whole run, its running episodes included."""
-        return {**super().state_dict(), "play": None if self.play is None else self.play.state_dict()}
+        """The whole run, the running and the paused episodes included."""
+        plays = {str(task): play.state_dict() for task, play in sorted(self._plays.items())}
+        return {**super().state_dict(), "plays": plays}
 
-    def load_state_dict(self, state: dict[str, object]) -> None:
-        """Continue a run; ``reproducible`` tells whether the running episodes came back as they were."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue a run; ``reproducible`` tells whether its episodes came back as they were."""
         super().load_state_dict(state)
-        if state["play"] is not None:
-            self.play = self._make_play(self.task)
-            self.reproducible = self.play.load_state_dict(state["play"])  # type: ignore[arg-type]
+        replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]
+        self.reproducible = all(replayed)
 
     def close(self) -> None:
         """Free the environments."""

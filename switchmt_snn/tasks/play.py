@@ -29,6 +29,7 @@ class Play:
             AtariVectorEnv stacks).
         returns: raw return of each running episode.
         lengths_steps: length of each running episode.
+        over: copies without a running episode; :meth:`begin` must start one before the next :meth:`step`.
     """
 
     def __init__(self, suite: TaskSuite, task: int, num_envs: int) -> None:
@@ -39,6 +40,7 @@ class Play:
         self.observations: Frames = np.zeros((num_envs, *suite.observation_shape), suite.frame_dtype)
         self.returns = np.zeros(num_envs)
         self.lengths_steps = np.zeros(num_envs, np.int64)
+        self.over = np.ones(num_envs, np.bool_)
         self._seeds = np.zeros(num_envs, np.int64)
         self._actions: list[list[int]] = [[] for _ in range(num_envs)]
 
@@ -49,6 +51,7 @@ class Play:
         self.observations[env_ids, -self._channels :] = frames
         self.returns[env_ids] = 0.0
         self.lengths_steps[env_ids] = 0
+        self.over[env_ids] = False
         self._seeds[env_ids] = seeds
         for env_id in env_ids:
             self._actions[env_id] = []
@@ -62,6 +65,7 @@ class Play:
         self.observations[:, -c:] = result.frames
         self.returns += result.rewards
         self.lengths_steps += 1
+        self.over[result.ended] = True
         for env_id, action in enumerate(actions.tolist()):
             self._actions[env_id].append(action)
         return result
