@@ -129,8 +129,8 @@ def minatar_page() -> str:
     )
     lines += [
         "",
-        "The training returns in `episodes.csv` are lower than these: in these runs a visit of 1,000 steps gave each of",
-        "8 copies 125 steps, and longer episodes were cut without a row. Now they pause (docs/algorithm.md, 13).",
+        "The training returns in `episodes.csv` are lower than these: in these runs a visit of 1,000 steps gave each",
+        "of 8 copies 125 steps, and longer episodes were cut without a row. Now they pause (docs/algorithm.md, 13).",
     ]
     lines += ["", "## Steps and time", "", "| run | steps by game | updates | minutes |", "|---|---|---|---|"]
     for name in facts:

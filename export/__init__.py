@@ -1,5 +1,5 @@
-"""Export of trained networks (imported as ``switchmt_snn.export``): ONNX, NIR, spike counts, energy.
+"""Export of trained networks (imported as ``switchmt_snn.export``).
 
-The package exists so that installs and wheels carry it; the exporters are the subject of the next release
-(see CHANGELOG.md).
+``fold`` makes one chain of layers of a network, ``to_onnx`` and ``to_nir`` write it, ``parity`` compares what was
+written with the trained network, and ``run`` does all of it for a run folder.
 """

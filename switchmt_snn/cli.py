@@ -23,6 +23,7 @@ usage: switchmt-snn COMMAND [options]
 
   train [CONFIG]      train, or continue a run (CONFIG: a YAML file or a preset; default: quickstart)
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
+  export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   doctor              versions, games and devices of this installation
 
@@ -60,8 +61,34 @@ class EvaluateOptions:
     """Only this task."""
     checkpoint: Literal["last", "best"] = "last"
     """Which weights."""
+    engine: Literal["torch", "onnx", "nir"] = "torch"
+    """What plays: the trained network, or the run's exported files in onnxruntime or the NIR interpreter."""
     json: bool = False
     """Print the scores as JSON."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write a run's network as ONNX and NIR files, and compare them with it; without a format: all that fit it."""
+
+    onnx: bool = False
+    """decision.onnx (all tasks, frames in, Q-values out) and step.onnx (one simulation step, membranes outside)."""
+    nir: bool = False
+    """One NIR graph and one JSON file per task."""
+    task: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Also decision_TASK.onnx with this task folded in; may be given several times."""
+    int8: bool = False
+    """Weights as 8-bit integers, symmetric per output channel; the effect on decisions is measured."""
+    nir_profile: Literal["portable", "spikingjelly", "exact", "legacy"] = "portable"
+    """NIR for most importers, for SpikingJelly's default dt, with loops for a subtract reset, or for nir <= 1.0.4."""
+    parity_decisions: int = 1000
+    """Recorded decisions per task on which the files are compared with the network."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Which weights."""
+    out: Path | None = None
+    """Folder to write to. Default: the run's export/."""
+    json: bool = False
+    """Print files and parity as JSON."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +117,7 @@ def _main(argv: list[str]) -> int:
     commands: dict[str, Callable[[list[str]], int]] = {
         "train": _train,
         "evaluate": _evaluate,
+        "export": _export,
         "describe": _describe,
         "doctor": _doctor,
     }
@@ -197,12 +225,52 @@ def _evaluate(argv: list[str]) -> int:
     path = Path(run) if run is not None else latest_run()
     names = ("episodes", "epsilon", "seed", "num_envs")
     protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    evaluation = evaluate(path, options.task, options.checkpoint, **protocol)
-    if options.json:
-        print(json.dumps({"run": str(path), **evaluation.to_dict()}))
+    if options.engine == "torch":
+        evaluation, facts = evaluate(path, options.task, options.checkpoint, **protocol), {}
     else:
-        Console().print(evaluation_table(evaluation))
+        from switchmt_snn.export.run import evaluate_engine
+
+        evaluation, share = evaluate_engine(options.engine, path, options.task, options.checkpoint, **protocol)
+        facts = {"engine": options.engine, "equal_actions_share": share}
+    if options.json:
+        print(json.dumps({"run": str(path), **facts, **evaluation.to_dict()}))
+        return 0
+    Console().print(evaluation_table(evaluation))
+    if facts:
+        print(f"played by {options.engine}; {share:.2%} of its decisions are those of the trained network")
+    else:
         print(path / "evaluations")
+    return 0
+
+
+def _export(argv: list[str]) -> int:
+    run, rest = _leading_name(argv)
+    options = _parse(ExportOptions, rest, "export", ExportOptions())
+    from switchmt_snn.export.run import ExportSettings, export
+    from switchmt_snn.viewing.tables import parity_table
+
+    settings = ExportSettings(
+        onnx=options.onnx,
+        nir=options.nir,
+        tasks=options.task,
+        int8=options.int8,
+        nir_profile=options.nir_profile,
+        parity_decisions=options.parity_decisions,
+    )
+    console = Console(stderr=options.json)
+    result = export(
+        Path(run) if run is not None else None,
+        settings,
+        options.checkpoint,
+        options.out,
+        lambda text: console.print(text, highlight=False, soft_wrap=True),
+    )
+    if options.json:
+        files = {name: str(path) for name, path in result.files.items()}
+        print(json.dumps({"folder": str(result.folder), "files": files, "parity": result.parity}))
+        return 0
+    console.print(parity_table(result.parity))
+    print(result.folder)
     return 0
 
 

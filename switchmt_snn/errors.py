@@ -34,6 +34,16 @@ class CheckpointError(SwitchMTError):
     """No checkpoint of the run can be read whole."""
 
 
+class ExportError(SwitchMTError):
+    """A network, a file or an option cannot be exported or read back."""
+
+
+class ParityError(SwitchMTError):
+    """An exported file does not decide as the trained network does."""
+
+    exit_code = 1
+
+
 class MissingExtraError(SwitchMTError):
     """An optional package is needed; the message names the extra that installs it."""
 

@@ -5,18 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.config import EvaluationConfig, TasksConfig
-from switchmt_snn.learning.agent import Agent
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
 QFunction = Callable[[npt.NDArray[Any], int], npt.NDArray[np.float32]]
 """Stacked observations ``[n, ...]`` and a task -> Q-values ``[n, A]``, -inf where an action does not exist."""
+
+
+class DecisionMaker(Protocol):
+    """What an evaluation needs of an agent: the trained network is one, an exported file another."""
+
+    suite: TaskSuite
+    step: int
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers of a random encoding."""
+
+    def q_values(self, observation: npt.NDArray[Any], task: int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]`` of stacked observations ``[B, ...]``, -inf where an action does not exist."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +121,9 @@ class Evaluation:
         return {"step": self.step, "protocol": asdict(self.protocol), "tasks": [asdict(row) for row in self.tasks]}
 
 
-def evaluate_agent(agent: Agent, protocol: EvaluationProtocol, tasks: tuple[str, ...] | None = None) -> Evaluation:
+def evaluate_agent(
+    agent: DecisionMaker, protocol: EvaluationProtocol, tasks: tuple[str, ...] | None = None
+) -> Evaluation:
     """Play ``protocol.episodes`` episodes of each task with the agent and with the random policy.
 
     Deterministic for a protocol: an episode's environment and its random actions come from (seed, task, episode).

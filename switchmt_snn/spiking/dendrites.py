@@ -40,9 +40,12 @@ class ActiveDendrites(nn.Module):
 
 
 def keep_k_winners(current: Tensor, k: int) -> Tensor:
-    """Zero all but the k largest input currents of ``[T, B, N]`` at each step (Iyer et al. 2022: k-winner-take-all)."""
+    """Zero all but the k largest input currents of ``[T, B, N]`` at each step (Iyer et al. 2022: k-winner-take-all).
+
+    Of equal currents the one with the lower index wins, as in ONNX; ``torch.topk`` leaves that open.
+    """
     if k >= current.shape[-1]:
         return current
-    winners = current.topk(k, dim=-1).indices
+    winners = current.sort(dim=-1, descending=True, stable=True).indices[..., :k]
     mask = torch.zeros_like(current).scatter_(-1, winners, 1.0)
     return current * mask

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich import box
 from rich.table import Table
 
@@ -76,6 +78,31 @@ def _score_cells(row: TaskScore) -> list[str]:
         "" if row.mean_q is None else f"{row.mean_q:.3f}",
         str(row.episodes),
     ]
+
+
+def parity_table(parity: dict[str, Any]) -> Table:
+    """What ``export`` compared: exact numbers, recorded play, other simulators (the content of parity.json)."""
+    table = _table(
+        "Parity with the trained network",
+        "exact: a copy whose sums do not round; recorded: real weights and play, where rounding near a threshold may "
+        "flip a spike (flips: decisions with at least one). Bitwise: every spike and every Q-value.",
+    )
+    _add_columns(table, ("check", "task", "engine"), ("n", "flips", "max |dQ|", "same action", "bitwise"))
+    for check, rows in (("exact", parity["dyadic"]), ("recorded", parity["recorded"])):
+        for row in rows:
+            share, flips = row["equal_actions_share"], row["decisions_with_flips"]
+            flipped = f"{flips:,}" if row["flipped_spikes"] else "-"
+            difference = f"{row['largest_q_difference']:.1e}" if row["largest_q_difference"] else "0"
+            numbers = (f"{row['decisions']:,}", flipped, difference, f"{share:.2%}", _yes(row["bitwise"]))
+            table.add_row(check, row["task"], row["engine"], *numbers)
+    for row in parity["simulators"]:
+        n = f"{row['decisions']:,}"
+        table.add_row("exact", row["task"], row["simulator"], n, "", "", "", _yes(row["bitwise"]))
+    return table
+
+
+def _yes(holds: bool) -> str:
+    return "yes" if holds else "no"
 
 
 def methods_table(methods: dict[str, MethodDescription]) -> Table:

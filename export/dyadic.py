@@ -1,0 +1,111 @@
+"""A dyadic copy of an agent: every number a multiple of a power of two, so that float32 arithmetic is exact.
+
+Where nothing is rounded, the order of sums cannot matter, and two programs that compute the same network must agree
+bitwise. A difference on the copy is an error in an export, never rounding.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.spiking.dendrites import ActiveDendrites
+from switchmt_snn.spiking.network import Stream
+from switchmt_snn.spiking.neurons import SpikingLayer
+from switchmt_snn.spiking.normalization import TaskBatchNorm
+
+_ANN_WEIGHTS_PER_UNIT = 16
+"""An ANN's activations grow bits layer by layer; with this many weights of +-1 per unit they stay below 2^24."""
+
+
+def dyadic_copy(agent: Agent) -> Agent:
+    """A copy of the same shape whose weights, normalisation, gains and input scale are dyadic."""
+    network = copy.deepcopy(agent.network)
+    with torch.no_grad():
+        for module in network.modules():
+            if isinstance(module, (nn.Conv2d, nn.Linear)):
+                _round_synapses(module, network.spiking)
+            elif isinstance(module, TaskBatchNorm):
+                _round_normalization(module, network.spiking)
+            elif isinstance(module, ActiveDendrites):
+                _round_dendrites(module)
+            elif isinstance(module, SpikingLayer):
+                module.leaky.threshold.copy_(_to_grid(module.leaky.threshold, 3).clamp(min=0.125))
+                if float(module.leaky.beta.detach()) != 1.0:
+                    module.leaky.beta.copy_(_to_grid(module.leaky.beta, 2))
+        if "advantage" in network.streams:
+            _center(cast(Stream, network.streams["advantage"]).head)
+    scale = agent.suite.scale if math.log2(agent.suite.scale).is_integer() else 2.0**-8
+    network.observation = replace(network.observation, scale=scale)
+    return Agent(network, replace(agent.suite, scale=scale), agent.config, torch.device("cpu"), agent.step)
+
+
+def dyadic_observations(observations: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Observations with few enough bits for exact sums: the upper four of a byte, or sixteenths within +-8."""
+    if observations.dtype == np.uint8:
+        return np.bitwise_and(observations, 0xF0) if observations.max(initial=0) > 1 else observations
+    rounded: npt.NDArray[Any] = np.clip(np.rint(observations * 16), -128, 128) / 16
+    return rounded.astype(observations.dtype)
+
+
+def _to_grid(value: Tensor, bits: int) -> Tensor:
+    return torch.round(value * float(2**bits)) / float(2**bits)
+
+
+def _round_synapses(module: nn.Conv2d | nn.Linear, spiking: bool) -> None:
+    if spiking:
+        module.weight.copy_(_to_grid(module.weight, 6))
+    else:
+        flat = module.weight.flatten(1)
+        kept = torch.zeros_like(flat)
+        largest = flat.abs().topk(min(_ANN_WEIGHTS_PER_UNIT, flat.shape[1]), dim=1).indices
+        module.weight.copy_(kept.scatter(1, largest, torch.sign(flat).gather(1, largest)).view_as(module.weight))
+    if module.bias is not None:
+        module.bias.copy_(_to_grid(module.bias, 4))
+
+
+def _round_normalization(module: TaskBatchNorm, spiking: bool) -> None:
+    """1 / sqrt(var + epsilon) becomes a power of two; epsilon one, too, so that the variance is exact."""
+    module.epsilon = 2.0**-10
+    inverse = torch.round(-0.5 * torch.log2(module.running_var_KC + module.epsilon)).clamp(-3, 3)
+    if not spiking:
+        inverse.zero_()
+    module.running_var_KC.copy_(2.0 ** (-2 * inverse) - module.epsilon)
+    module.running_mean_KC.copy_(_to_grid(module.running_mean_KC, 4))
+    module.bias.copy_(_to_grid(module.bias, 4))
+    module.weight.copy_(_to_grid(module.weight, 2) if spiking else torch.sign(module.weight))
+
+
+def _round_dendrites(module: ActiveDendrites) -> None:
+    """Every gain becomes a multiple of 1/8: a float32 response is searched whose sigmoid is exactly that."""
+    rows, _, tasks = module.segments_NSK.shape
+    for task in range(tasks):
+        gain = (_to_grid(module(task), 3)).clamp(0.125, 0.875)
+        response = torch.logit(gain)
+        # All segments alike: the largest, and the largest in absolute value, is then this one.
+        candidates = [response]
+        for direction in (torch.inf, -torch.inf):
+            moved = response
+            for _ in range(8):
+                moved = torch.nextafter(moved, torch.full_like(moved, direction))
+                candidates.append(moved)
+        best, error = response, torch.full_like(response, torch.inf)
+        for candidate in candidates:
+            module.segments_NSK[:, :, task] = candidate.view(rows, 1)
+            missed = (module(task) - gain).abs()
+            best, error = torch.where(missed < error, candidate, best), torch.minimum(missed, error)
+        module.segments_NSK[:, :, task] = best.view(rows, 1)
+
+
+def _center(head: nn.Linear) -> None:
+    """Advantages that sum to zero over the actions, so that their mean is exact for any number of actions."""
+    head.weight[-1] = -head.weight[:-1].sum(0)
+    head.bias[-1] = -head.bias[:-1].sum()

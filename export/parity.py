@@ -1,0 +1,241 @@
+"""Parity: does an exported file decide as the trained network does?
+
+(a) bitwise, on a dyadic copy of the network, where no sum rounds; (b) on the real weights and recorded play, where
+rounding may flip a spike near the threshold: how often, and does the action change.
+
+Shapes: T simulation steps, B batch (decisions), L neuron layers, A actions.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import nir
+import numpy as np
+import numpy.typing as npt
+import onnxruntime
+import torch
+
+from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_out
+from switchmt_snn.export.fold import FoldedNetwork
+from switchmt_snn.export.nir_interpreter import Float, NirInterpreter
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.spiking.neurons import SpikingLayer
+
+CHUNK = 64
+"""Decisions that are held in memory at once."""
+MIN_EQUAL_ACTIONS = 0.99
+"""On real weights, an export that agrees on fewer actions fails."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a batch of decisions did: Q ``[B, A]``, and each layer's spikes ``[T, B, N]`` (none for an ANN)."""
+
+    q_BA: Float
+    spikes: dict[str, npt.NDArray[np.bool_]]
+
+
+@dataclass
+class Comparison:
+    """Decisions of an engine against those of the trained network.
+
+    Attributes:
+        flipped_spikes: by layer, in forward order; one spike that is there or missing, at any step.
+        decisions_with_flips: decisions with at least one.
+        largest_q_difference: over actions that exist.
+        equal_q: decisions with bitwise equal Q.
+        equal_actions: decisions with the same greedy action.
+    """
+
+    engine: str
+    task: str
+    decisions: int = 0
+    flipped_spikes: dict[str, int] = field(default_factory=dict)
+    decisions_with_flips: int = 0
+    largest_q_difference: float = 0.0
+    equal_q: int = 0
+    equal_actions: int = 0
+
+    def add(self, expected: Trace, seen: Trace) -> None:
+        """Count one batch."""
+        flips_B = np.zeros(len(expected.q_BA), np.int64)
+        for name in seen.spikes:
+            flips_here_B = (expected.spikes[name] != seen.spikes[name]).sum(axis=(0, 2))
+            self.flipped_spikes[name] = self.flipped_spikes.get(name, 0) + int(flips_here_B.sum())
+            flips_B += flips_here_B
+        exists = np.isfinite(expected.q_BA)
+        difference = np.abs(np.where(exists, expected.q_BA, 0) - np.where(exists, seen.q_BA, 0))
+        self.decisions += len(flips_B)
+        self.decisions_with_flips += int((flips_B > 0).sum())
+        self.largest_q_difference = max(self.largest_q_difference, float(difference.max(initial=0.0)))
+        self.equal_q += int((expected.q_BA == seen.q_BA).all(axis=1).sum())
+        self.equal_actions += int((expected.q_BA.argmax(axis=1) == seen.q_BA.argmax(axis=1)).sum())
+
+    @property
+    def bitwise(self) -> bool:
+        """Whether everything was equal."""
+        return self.decisions_with_flips == 0 and self.equal_q == self.decisions
+
+    @property
+    def equal_actions_share(self) -> float:
+        """Share of decisions with the same action."""
+        return self.equal_actions / self.decisions
+
+    @property
+    def first_difference(self) -> str:
+        """The first layer that differs, in words."""
+        return next(
+            (name for name, flips in self.flipped_spikes.items() if flips), "head" if not self.bitwise else "none"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self) | {"bitwise": self.bitwise, "equal_actions_share": self.equal_actions_share}
+
+
+def trace_torch(agent: Agent, observations: npt.NDArray[Any], task: int, seed: int) -> Trace:
+    """The trained network itself; the streams' layers side by side as ``hidden``."""
+    activity: dict[str, torch.Tensor] = {}
+    agent.network.eval()
+    with torch.inference_mode():
+        generator = torch.Generator().manual_seed(seed)
+        q_BA = agent.network(torch.from_numpy(observations), task, activity=activity, generator=generator)
+    invalid_A = ~agent.suite.valid_actions_KA[task]
+    q = np.where(invalid_A, np.float32(-np.inf), q_BA.numpy())
+    if not agent.network.spiking:
+        return Trace(q, {})
+    parts: dict[str, list[Any]] = {}
+    for name, spikes in activity.items():
+        parts.setdefault(name if name in agent.network.trunk else "hidden", []).append(spikes.flatten(2).numpy() > 0)
+    return Trace(q, {name: np.concatenate(values, axis=2) for name, values in parts.items()})
+
+
+def trace_nir(network: FoldedNetwork, graph: nir.NIRGraph, encoded_TB: Float, task: int) -> Trace:
+    """A NIR graph in the reference interpreter."""
+    interpreter = NirInterpreter(graph, reset=str(graph.metadata["reset"]))
+    names = {layer.name: f"{layer.name}_neurons" for layer in network.hidden_layers}
+    outputs, recorded = interpreter.run(encoded_TB, list(names.values()))
+    settings = network.config.network
+    q = read_out(outputs, settings.readout, settings.readout_beta)
+    q = np.where(network.suite.valid_actions_KA[task], q, np.float32(-np.inf))
+    return Trace(q, {name: _flat(recorded[node]) > 0 for name, node in names.items()})
+
+
+def trace_onnx(
+    network: FoldedNetwork,
+    decision: OnnxAgent,
+    step: onnxruntime.InferenceSession | None,
+    observations: npt.NDArray[Any],
+    encoded_TB: Float,
+    task: int,
+    seed: int,
+) -> Trace:
+    """``decision.onnx`` for Q and ``step.onnx`` for every spike; their spike counts must agree.
+
+    Raises:
+        AssertionError: the two files count different spikes.
+    """
+    batch = len(observations)
+    tasks_B = np.full(batch, task)
+    decision.reseed(seed)
+    decided = decision.decide(observations, tasks_B)
+    if step is None:
+        return Trace(decided["q_values"], {})
+    layers = network.hidden_layers
+    membranes = {f"membrane_{x.name}": np.zeros((batch, *x.output_shape), np.float32) for x in layers}
+    spikes: dict[str, list[npt.NDArray[np.bool_]]] = {layer.name: [] for layer in layers}
+    names = [value.name for value in step.get_outputs()]
+    takes_task = any(value.name == "task" for value in step.get_inputs())
+    for encoded_B in encoded_TB:
+        fed = {"encoded": np.ascontiguousarray(encoded_B), **membranes, **({"task": tasks_B} if takes_task else {})}
+        out = dict(zip(names, step.run(names, fed), strict=True))
+        membranes = {name: out[f"{name}_next"] for name in membranes}
+        for name, values in spikes.items():
+            values.append(out[f"spikes_{name}"].reshape(batch, -1) > 0)
+    stacked = {name: np.stack(values) for name, values in spikes.items()}
+    counts_BL = np.stack([values.sum(axis=(0, 2)) for values in stacked.values()], axis=1)
+    assert np.array_equal(counts_BL, decided["spike_counts"]), "decision.onnx and step.onnx count different spikes"
+    return Trace(decided["q_values"], stacked)
+
+
+def _flat(values_TB: Float) -> Float:
+    return values_TB.reshape(*values_TB.shape[:2], -1)
+
+
+@dataclass(frozen=True)
+class Exports:
+    """Exported models to compare with a network; None where a kind was not exported."""
+
+    network: FoldedNetwork
+    decision: bytes | None = None
+    step: bytes | None = None
+    graphs: dict[str, nir.NIRGraph] | None = None
+
+
+def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray[Any]) -> list[Comparison]:
+    """Compare every exported model of a task with the network on some observations, chunk by chunk."""
+    name = agent.suite.names[task]
+    network = exports.network
+    decision = step = None
+    results: dict[str, Comparison] = {}
+    if exports.decision is not None:
+        decision = OnnxAgent(exports.decision, agent.suite, agent.config)
+        step = onnx_session(exports.step) if exports.step is not None else None
+        results["onnx"] = Comparison("onnx", name)
+    if exports.graphs is not None:
+        results["nir"] = Comparison("nir", name)
+    for seed, chunk in enumerate(_chunks(observations)):
+        expected = trace_torch(agent, chunk, task, seed)
+        encoded_TB = encode(agent.suite, agent.config, chunk, seed)
+        if decision is not None:
+            results["onnx"].add(expected, trace_onnx(network, decision, step, chunk, encoded_TB, task, seed))
+        if exports.graphs is not None:
+            results["nir"].add(expected, trace_nir(network, exports.graphs[name], encoded_TB, task))
+    return list(results.values())
+
+
+def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any]) -> bool:
+    """Whether the network computes the same in float32 and in float64: then nothing was rounded.
+
+    Rounding of Q by a mean over T that is no power of two is left out; the spikes decide.
+    """
+    wide = copy.deepcopy(agent.network).double()
+    for module in wide.modules():
+        if isinstance(module, SpikingLayer):
+            module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
+    scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, 0).copy())
+    narrow_activity: dict[str, torch.Tensor] = {}
+    wide_activity: dict[str, torch.Tensor] = {}
+    narrow, wide_q = (
+        _from_encoded(network, scaled.to(dtype), task, activity)
+        for network, dtype, activity in (
+            (agent.network, torch.float32, narrow_activity),
+            (wide, torch.float64, wide_activity),
+        )
+    )
+    same = all(torch.equal(narrow_activity[name].double(), wide_activity[name]) for name in wide_activity)
+    T = agent.config.network.timesteps
+    return same and (T & (T - 1) != 0 or torch.equal(narrow.double(), wide_q))
+
+
+def _step(x: torch.Tensor) -> torch.Tensor:
+    return (x > 0).to(x.dtype)
+
+
+def _from_encoded(network: Any, encoded: torch.Tensor, task: int, activity: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Run a network on inputs that are encoded already."""
+    replaced = copy.copy(network)
+    replaced.encoder = lambda x, generator: encoded
+    replaced.observation = network.observation
+    with torch.inference_mode():
+        q: torch.Tensor = replaced.eval()(torch.zeros(1, dtype=encoded.dtype), task, activity=activity)
+    return q
+
+
+def _chunks(observations: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:
+    for start in range(0, len(observations), CHUNK):
+        yield np.ascontiguousarray(observations[start : start + CHUNK])

@@ -1,0 +1,105 @@
+"""Recorded play: observations that a trained agent really sees, kept in the run folder for parity and profiling."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.errors import ExportError
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.tasks.play import Play, episode_seed
+
+COPIES = 4
+"""Copies of a task that are recorded side by side; each gives a contiguous stretch."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Decisions of one task, in order of play, one copy of the task after the other.
+
+    Attributes:
+        observations: raw stacked observations ``[N, *shape]``.
+        actions: what was done ``[N]``.
+        epsilon: share of random actions while it was recorded.
+        seed: of the episodes.
+    """
+
+    task: str
+    observations: npt.NDArray[Any]
+    actions: npt.NDArray[np.int64]
+    epsilon: float
+    seed: int
+
+
+def file_name(task: str) -> str:
+    """A task's name as part of a file's name (Gymnasium ids hold slashes)."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", task)
+
+
+def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Recording:
+    """At least ``decisions`` recorded decisions of a task: read if ``folder`` has them, else played and stored.
+
+    Played like an evaluation: greedy with the run's evaluation epsilon and seed, up to whole steps of all copies.
+    """
+    config = agent.config.evaluation
+    path = folder / f"{file_name(task)}-step-{agent.step}.npz"
+    if path.exists():
+        recording = _read(path, task, agent.suite.observation_shape)
+        if len(recording.actions) >= decisions and recording.seed == config.seed:
+            return recording
+    recording = _play(agent, task, decisions, config.epsilon, config.seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp.npz")
+    np.savez_compressed(
+        temporary,
+        observations=recording.observations,
+        actions=recording.actions,
+        epsilon=np.asarray(recording.epsilon),
+        seed=np.asarray(recording.seed),
+    )
+    temporary.rename(path)
+    return recording
+
+
+def _read(path: Path, task: str, shape: tuple[int, ...]) -> Recording:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            observations, actions = stored["observations"], stored["actions"]
+            recording = Recording(task, observations, actions, float(stored["epsilon"]), int(stored["seed"]))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ExportError(f"recorded play {path} cannot be read ({error}), expected an .npz file; delete it") from error
+    if observations.shape[1:] != shape:
+        raise ExportError(f"recorded play {path} has shape {observations.shape[1:]}, expected {shape}; delete it")
+    return recording
+
+
+def _play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> Recording:
+    index, suite = agent.suite.index(task), agent.suite
+    steps = -(-decisions // COPIES)
+    rng = np.random.default_rng([seed, index])
+    valid = np.flatnonzero(suite.valid_actions_KA[index])
+    agent.reseed(seed)
+    play = Play(suite, index, COPIES)
+    observations = np.empty((COPIES, steps, *suite.observation_shape), suite.frame_dtype)
+    actions = np.empty((COPIES, steps), np.int64)
+    episodes = 0
+    try:
+        for step in range(steps):
+            over = np.flatnonzero(play.over)
+            if len(over):
+                play.begin(over, np.asarray([episode_seed(seed, index, episodes + i) for i in range(len(over))]))
+                episodes += len(over)
+            explore = rng.random(COPIES) < epsilon
+            random_actions = valid[rng.integers(0, len(valid), COPIES)]
+            observations[:, step] = play.observations
+            actions[:, step] = np.where(explore, random_actions, agent.act(play.observations, index))
+            play.step(actions[:, step])
+    finally:
+        play.close()
+    flat = observations.reshape(-1, *suite.observation_shape)
+    return Recording(task, flat, actions.reshape(-1), epsilon, seed)

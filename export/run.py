@@ -1,0 +1,362 @@
+"""Export a run: write the files, then prove them against the trained network. Used by the command line and Python."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import nir
+import numpy as np
+import numpy.typing as npt
+import onnx
+
+from switchmt_snn import __version__
+from switchmt_snn.errors import ConfigError, ExportError, ParityError
+from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations
+from switchmt_snn.export.engines import ComparedAgent, NirAgent, OnnxAgent, encode, read_nir
+from switchmt_snn.export.fold import FoldedNetwork, fold, metadata, quantized
+from switchmt_snn.export.nir_interpreter import NirInterpreter
+from switchmt_snn.export.parity import MIN_EQUAL_ACTIONS, Comparison, Exports, compare, is_exact
+from switchmt_snn.export.recording import Recording, file_name, recorded_play
+from switchmt_snn.export.simulators import SIMULATORS, simulate
+from switchmt_snn.export.to_nir import NirProfile, can_express, nir_graph, write_nir
+from switchmt_snn.export.to_onnx import OPSET, decision_model, step_model
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
+from switchmt_snn.learning.files import write_atomically
+from switchmt_snn.learning.run import load_agent
+from switchmt_snn.learning.run_folder import RunFolder, latest_run
+
+DYADIC_DECISIONS = 64
+SIMULATOR_DECISIONS = 32
+Note = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """What was written and how it compares.
+
+    Attributes:
+        files: paths by what they are.
+        parity: the content of ``parity.json``.
+    """
+
+    folder: Path
+    files: dict[str, Path]
+    parity: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """What to write.
+
+    Attributes:
+        onnx: ``decision.onnx`` for all tasks, and ``step.onnx`` if the network spikes. With neither ``onnx`` nor
+            ``nir``, every format that can express the network is written.
+        nir: one ``<task>.nir`` and ``<task>.json`` per task.
+        tasks: also one ``decision_<task>.onnx`` for each of these.
+        int8: store the weights as 8-bit integers with one step per output channel.
+        nir_profile: see :mod:`switchmt_snn.export.to_nir`.
+        parity_decisions: recorded decisions per task that the files are compared on.
+    """
+
+    onnx: bool = False
+    nir: bool = False
+    tasks: tuple[str, ...] = ()
+    int8: bool = False
+    nir_profile: NirProfile = "portable"
+    parity_decisions: int = 1000
+
+
+def export(
+    run: str | Path | None = None,
+    settings: ExportSettings | None = None,
+    checkpoint: str = "last",
+    out: str | Path | None = None,
+    note: Note = lambda text: None,
+) -> ExportResult:
+    """Write a run's network as ONNX and NIR files and check them.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        settings: what to write.
+        checkpoint: ``last`` or ``best``.
+        out: where; None takes the run's ``export/`` folder.
+        note: told in a line what goes on.
+
+    Raises:
+        ExportError: the network cannot be expressed so.
+        ParityError: a file decides differently; ``parity.json`` says where.
+    """
+    settings = settings or ExportSettings()
+    if settings.parity_decisions < 1:
+        raise ConfigError(f"parity_decisions is {settings.parity_decisions}, expected at least 1")
+    run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    agent = load_agent(run_folder.path, checkpoint, "cpu")
+    specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
+    network = fold(agent)
+    exported = quantized(network) if settings.int8 else network
+    if not settings.onnx and not settings.nir:
+        settings = replace(settings, onnx=True, nir=can_express(network, settings.nir_profile))
+    folder = Path(out) if out is not None else run_folder.path / "export"
+    folder.mkdir(parents=True, exist_ok=True)
+    facts = _provenance(run_folder) | {"weights": "int8" if settings.int8 else "float32"}
+    files: dict[str, Path] = {}
+    if settings.onnx:
+        files |= _write_onnx(exported, folder, specialised, facts)
+    if settings.nir:
+        files |= _write_nir(exported, folder, settings.nir_profile, facts)
+    for name, path in files.items():
+        note(f"wrote {path} ({name})")
+    note("parity: comparing the files with the trained network")
+    recordings = {
+        task: recorded_play(agent, run_folder.path / "recordings", task, settings.parity_decisions)
+        for task in agent.suite.names
+    }
+    parity = _Parity(agent, exported, files, settings, recordings).check()
+    write_atomically(folder / "parity.json", json.dumps(facts | parity, indent=1).encode())
+    if parity["failures"]:
+        raise ParityError(
+            f"parity failed: {'; '.join(parity['failures'])}; expected the trained network's decisions; see "
+            f"{folder / 'parity.json'}"
+        )
+    return ExportResult(folder, files, parity)
+
+
+def _provenance(run_folder: RunFolder) -> dict[str, Any]:
+    config = (run_folder.path / "config.yaml").read_bytes()
+    return {
+        "tool": f"switchmt-snn {__version__}",
+        "git_commit": _git_commit(),
+        "config_sha256": hashlib.sha256(config).hexdigest(),
+    }
+
+
+def _git_commit() -> str:
+    """The commit of this package's source, or ``unknown`` for an installed package."""
+    here = Path(__file__).resolve().parent
+    try:
+        found = subprocess.run(["git", "-C", here, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return found.stdout.strip() if found.returncode == 0 else "unknown"
+
+
+def _write_onnx(
+    network: FoldedNetwork, folder: Path, specialised: tuple[str, ...], facts: dict[str, Any]
+) -> dict[str, Path]:
+    models: dict[str, onnx.ModelProto] = {"decision": decision_model(network)}
+    if network.spiking:
+        models["step"] = step_model(network)
+    for task in specialised:
+        models[f"decision_{file_name(task)}"] = decision_model(network, network.suite.index(task))
+    files = {}
+    for name, model in models.items():
+        for key, value in (facts | {"opset": str(OPSET)}).items():
+            entry = model.metadata_props.add()
+            entry.key, entry.value = key, value
+        files[f"{name}.onnx"] = folder / f"{name}.onnx"
+        write_atomically(files[f"{name}.onnx"], model.SerializeToString())
+        (folder / f"{name}.onnx.data").unlink(missing_ok=True)  # weights of an export by another tool
+    return files
+
+
+def _write_nir(network: FoldedNetwork, folder: Path, profile: NirProfile, facts: dict[str, Any]) -> dict[str, Path]:
+    files = {}
+    for index, task in enumerate(network.suite.names):
+        graph = nir_graph(network, index, profile)
+        graph.metadata.update(facts)
+        path = folder / f"{file_name(task)}.nir"
+        temporary = path.with_suffix(".tmp.nir")
+        write_nir(graph, temporary)
+        temporary.rename(path)
+        beside = metadata(network) | facts | {"task": task, "profile": profile, "dt": graph.metadata["dt"]}
+        write_atomically(path.with_suffix(".json"), json.dumps(beside, indent=1).encode())
+        files[path.name] = path
+    return files
+
+
+class _Parity:
+    """The checks of one export."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        exported: FoldedNetwork,
+        files: dict[str, Path],
+        settings: ExportSettings,
+        recordings: dict[str, Recording],
+    ) -> None:
+        self.agent, self.exported, self.files, self.settings = agent, exported, files, settings
+        self.recordings = recordings
+        self.failures: list[str] = []
+
+    def check(self) -> dict[str, Any]:
+        """All comparisons as plain values; ``failures`` is empty if everything agrees as it must."""
+        dyadic, real, simulators, stored = [], [], [], []
+        twin = dyadic_copy(self.agent)
+        copied = self._models(fold(twin))
+        written = self._written()
+        for task, name in enumerate(self.agent.suite.names):
+            observations = self.recordings[name].observations
+            exact_observations = dyadic_observations(_spread(observations, DYADIC_DECISIONS))
+            exact = is_exact(twin, task, exact_observations)
+            if not exact:
+                self.failures.append(f"{name}: the dyadic copy rounds, so it proves nothing (please report this)")
+            for comparison in compare(twin, copied, task, exact_observations):
+                dyadic.append(comparison.to_dict() | {"exact_arithmetic": exact})
+                if exact and not self._agrees(comparison):
+                    self.failures.append(
+                        f"{name}, {comparison.engine}: not bitwise equal on exact numbers, first in layer "
+                        f"{comparison.first_difference}"
+                    )
+            for comparison in compare(self.agent, written, task, observations):
+                real.append(comparison.to_dict())
+                if not self.settings.int8 and comparison.equal_actions_share < MIN_EQUAL_ACTIONS:
+                    self.failures.append(
+                        f"{name}, {comparison.engine}: {comparison.equal_actions_share:.1%} equal actions, first "
+                        f"difference in layer {comparison.first_difference}"
+                    )
+            if self.settings.int8 and written.decision is not None:
+                stored.append(self._stored_integers(written.decision, name, observations))
+            if copied.graphs is not None:
+                simulators += self._simulators(twin, copied.graphs[name], exact_observations, name)
+        return {
+            "dyadic": dyadic,
+            "recorded": real,
+            "simulators": simulators,
+            "int8_storage": stored,
+            "criteria": {"dyadic": "bitwise", "recorded_min_equal_actions": MIN_EQUAL_ACTIONS},
+            "protocol": {
+                name: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed}
+                for name, r in self.recordings.items()
+            },
+            "failures": self.failures,
+        }
+
+    def _agrees(self, comparison: Comparison) -> bool:
+        """Bitwise; where T is no power of two, the mean over T rounds, and Q is compared to rounding."""
+        T = self.agent.config.network.timesteps
+        if T & (T - 1) == 0:
+            return comparison.bitwise
+        return comparison.decisions_with_flips == 0 and comparison.largest_q_difference < 1e-5
+
+    def _models(self, network: FoldedNetwork) -> Exports:
+        """The dyadic network in the formats that were written."""
+        decision = step = graphs = None
+        if self.settings.onnx:
+            decision = decision_model(network).SerializeToString()
+            step = step_model(network).SerializeToString() if network.spiking else None
+        if self.settings.nir:
+            names = network.suite.names
+            graphs = {name: nir_graph(network, k, self.settings.nir_profile) for k, name in enumerate(names)}
+        return Exports(network, decision, step, graphs)
+
+    def _written(self) -> Exports:
+        """What lies on the disk."""
+        graphs = None
+        if self.settings.nir:
+            graphs = {name: read_nir(self.files[f"{file_name(name)}.nir"]) for name in self.agent.suite.names}
+        decision, step = (
+            self.files[name].read_bytes() if name in self.files else None for name in ("decision.onnx", "step.onnx")
+        )
+        return Exports(self.exported, decision, step, graphs)
+
+    def _stored_integers(self, decision: bytes, task: str, observations: npt.NDArray[Any]) -> dict[str, Any]:
+        """The int8 file against a float32 graph with the same rounded weights: only the storage may differ."""
+        floats = replace(
+            self.exported, layers=tuple(replace(layer, weight_steps_O=None) for layer in self.exported.layers)
+        )
+        index = self.agent.suite.index(task)
+        stored, plain = (
+            OnnxAgent(model, self.agent.suite, self.agent.config).q_values(observations, index)
+            for model in (decision, decision_model(floats).SerializeToString())
+        )
+        equal = float((stored.argmax(axis=1) == plain.argmax(axis=1)).mean())
+        if equal < MIN_EQUAL_ACTIONS:
+            self.failures.append(f"{task}: the int8 file does not decide as its own integers do ({equal:.1%})")
+        return {"task": task, "decisions": len(stored), "equal_actions_share": equal}
+
+    def _simulators(
+        self, twin: Agent, graph: nir.NIRGraph, observations: npt.NDArray[Any], task: str
+    ) -> list[dict[str, Any]]:
+        """Every installed simulator on the dyadic graph, against the interpreter under the same convention."""
+        if self.settings.nir_profile in ("exact", "legacy") or twin.config.network.neuron != "IF":
+            return []  # loops, and files for older readers, are not what these importers take
+        inputs_TB = encode(twin.suite, twin.config, _spread(observations, SIMULATOR_DECISIONS), 0)
+        rows = []
+        for name, simulator in SIMULATORS.items():
+            if not simulator.installed or (name in ("norse", "nirtorch") and float(graph.metadata["dt"]) != 1.0):
+                continue
+            expected, _ = NirInterpreter(graph, **simulator.interpreter).run(inputs_TB)
+            seen = simulate(name, graph, inputs_TB)
+            equal = bool(np.array_equal(expected, seen))
+            rows.append(
+                {
+                    "simulator": name,
+                    "task": task,
+                    "convention": simulator.convention,
+                    "decisions": inputs_TB.shape[1],
+                    "bitwise": equal,
+                }
+            )
+            if not equal:
+                self.failures.append(f"{task}, {name}: not bitwise equal under its convention ({simulator.convention})")
+        return rows
+
+
+def _spread(observations: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
+    """Some observations from all over a recording."""
+    chosen = np.linspace(0, len(observations) - 1, min(count, len(observations))).astype(np.int64)
+    return np.ascontiguousarray(observations[chosen])
+
+
+def evaluate_engine(
+    engine: str, run: str | Path | None = None, task: str | None = None, checkpoint: str = "last", **protocol: Any
+) -> tuple[Evaluation, float]:
+    """Evaluate a run's exported files instead of its network.
+
+    Args:
+        engine: ``onnx`` (``export/decision.onnx``) or ``nir`` (``export/<task>.nir`` in the reference interpreter).
+        run: run folder; None takes the newest under ``runs/``.
+        task: one task's name; None evaluates all.
+        checkpoint: which weights the share of equal actions refers to.
+        protocol: fields of EvaluationConfig to change.
+
+    Returns:
+        The scores, and the share of greedy decisions with the trained network's action.
+
+    Raises:
+        ExportError: the run was not exported, or its files are of another training step.
+    """
+    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    agent = load_agent(folder.path, checkpoint, "cpu")
+    suite, config = agent.suite, agent.config
+    played: OnnxAgent | NirAgent
+    if engine == "onnx":
+        played = OnnxAgent(_exported(folder, "decision.onnx", "--onnx"), suite, config)
+    else:
+        paths = {name: _exported(folder, f"{file_name(name)}.nir", "--nir") for name in suite.names}
+        played = NirAgent({name: read_nir(path) for name, path in paths.items()}, suite, config)
+    if played.step != agent.step:
+        raise ExportError(
+            f"the exported files are of step {played.step}, expected {agent.step} (the {checkpoint} checkpoint); "
+            f"run switchmt-snn export {folder.path} again"
+        )
+    compared = ComparedAgent(played, agent)
+    settings = replace(config.evaluation, **protocol)
+    tasks = None if task is None else (suite.names[suite.index(task)],)
+    evaluation = evaluate_agent(compared, EvaluationProtocol.of(settings, config.tasks), tasks)
+    return evaluation, compared.equal / max(1, compared.decisions)
+
+
+def _exported(folder: RunFolder, name: str, flag: str) -> Path:
+    path = folder.path / "export" / name
+    if not path.is_file():
+        raise ExportError(f"no {path}, expected an exported run; run switchmt-snn export {folder.path} {flag}")
+    return path
