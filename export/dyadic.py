@@ -22,6 +22,10 @@ from switchmt_snn.spiking.network import Stream
 from switchmt_snn.spiking.neurons import SpikingLayer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
+_DYADIC_BETAS = (0.0, 0.5, 0.75, 0.875)
+"""Decays whose 1 - beta is a power of two, so that tau = dt / (1 - beta) is exact, too."""
+_MIN_RATE = 0.01
+_MAX_HALVINGS = 6
 _ANN_WEIGHTS_PER_UNIT = 16
 """An ANN's activations grow bits layer by layer; with this many weights of +-1 per unit they stay below 2^24."""
 
@@ -39,13 +43,34 @@ def dyadic_copy(agent: Agent) -> Agent:
                 _round_dendrites(module)
             elif isinstance(module, SpikingLayer):
                 module.leaky.threshold.copy_(_to_grid(module.leaky.threshold, 3).clamp(min=0.125))
-                if float(module.leaky.beta.detach()) != 1.0:
-                    module.leaky.beta.copy_(_to_grid(module.leaky.beta, 2))
+                if float(module.leaky.beta) != 1.0:
+                    module.leaky.beta.fill_(min(_DYADIC_BETAS, key=lambda beta: abs(beta - float(module.leaky.beta))))
         if "advantage" in network.streams:
             _center(cast(Stream, network.streams["advantage"]).head)
     scale = agent.suite.scale if math.log2(agent.suite.scale).is_integer() else 2.0**-8
     network.observation = replace(network.observation, scale=scale)
     return Agent(network, replace(agent.suite, scale=scale), agent.config, torch.device("cpu"), agent.step)
+
+
+def wake_silent_layers(agent: Agent, observations: npt.NDArray[Any]) -> None:
+    """Halve the threshold of layers in which hardly a neuron fires: a silent layer would prove nothing.
+
+    Args:
+        agent: a dyadic copy, changed in place.
+        observations: ``[B, *shape]`` of the first task.
+    """
+    network = agent.network
+    layers = {**dict(network.trunk.items()), **dict(network.streams.items())}
+    for name, layer in layers.items():
+        neurons = cast(Any, layer).neurons
+        for _ in range(_MAX_HALVINGS if network.spiking else 0):
+            activity: dict[str, Tensor] = {}
+            with torch.inference_mode():
+                network.eval()(torch.from_numpy(observations), 0, activity=activity)
+            if float(activity[name].mean()) >= _MIN_RATE:
+                break
+            with torch.no_grad():
+                neurons.leaky.threshold.div_(2.0)
 
 
 def dyadic_observations(observations: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -30,19 +30,27 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Neurons:
-    """Neurons of one layer; the same numbers for all of them.
+    """Neurons of one layer. Beta and threshold may differ by output channel: two streams may have learned their own.
 
     Attributes:
         kind: ``IF`` (beta 1), ``LIF``, or ``relu`` for the ANN methods.
-        beta: membrane decay per simulation step.
-        threshold: a neuron fires when its membrane is strictly above it.
+        beta_O: membrane decay per simulation step.
+        threshold_O: a neuron fires when its membrane is strictly above it.
         reset: ``zero`` or ``subtract``.
     """
 
     kind: str
-    beta: float
-    threshold: float
+    beta_O: Array
+    threshold_O: Array
     reset: str
+
+    def facts(self) -> dict[str, Any]:
+        """Plain values; one number where all neurons share it."""
+        beta, threshold = (
+            float(values[0]) if (values == values[0]).all() else values.tolist()
+            for values in (self.beta_O, self.threshold_O)
+        )
+        return {"neuron": self.kind, "beta": beta, "threshold": threshold}
 
 
 @dataclass(frozen=True)
@@ -151,11 +159,17 @@ def _float64(tensor: Tensor) -> Array:
     return cast(Array, tensor.detach().cpu().to(torch.float64).numpy())
 
 
-def _neurons(layer: nn.Module) -> Neurons:
-    if not isinstance(layer, SpikingLayer):
-        return Neurons("relu", 0.0, 0.0, "none")
-    beta = float(layer.leaky.beta.detach().clamp(0, 1))
-    return Neurons("IF" if beta == 1.0 else "LIF", beta, float(layer.leaky.threshold.detach()), layer.reset)
+def _neurons(layers: list[tuple[nn.Module, int]]) -> Neurons:
+    """Neuron layers side by side, each with its number of channels."""
+    betas, thresholds, reset = [], [], "none"
+    for layer, channels in layers:
+        if not isinstance(layer, SpikingLayer):
+            return Neurons("relu", np.zeros(1), np.zeros(1), "none")
+        betas.append(np.full(channels, float(layer.leaky.beta.detach().clamp(0, 1))))
+        thresholds.append(np.full(channels, float(layer.leaky.threshold.detach())))
+        reset = layer.reset
+    beta_O = np.concatenate(betas)
+    return Neurons("IF" if (beta_O == 1.0).all() else "LIF", beta_O, np.concatenate(thresholds), reset)
 
 
 def _trunk_layer(name: str, layer: TrunkLayer, tasks: range) -> Layer:
@@ -170,7 +184,8 @@ def _trunk_layer(name: str, layer: TrunkLayer, tasks: range) -> Layer:
             scale_KO[task] = _float64(norm.weight) / np.sqrt(var_O + norm.epsilon)
             shift_KO[task] = (bias_O - mean_O) * scale_KO[task] + _float64(norm.bias)
     stride = synapses.stride[0] if isinstance(synapses, nn.Conv2d) else None
-    return Layer(name, weight, scale_KO, shift_KO, stride, (), (), _neurons(layer.neurons))
+    neurons = _neurons([(layer.neurons, len(bias_O))])
+    return Layer(name, weight, scale_KO, shift_KO, stride, (), (), neurons)
 
 
 def _with_shapes(layers: list[Layer], network: QNetwork) -> list[Layer]:
@@ -209,7 +224,7 @@ def _streams(network: QNetwork, features: int, tasks: range) -> list[Layer]:
         stride=None,
         input_shape=(features,),
         output_shape=(sum(len(weight) for weight, _, _ in parts),),
-        neurons=_neurons(first.neurons),
+        neurons=_neurons([(stream.neurons, stream.synapses.out_features) for stream in streams.values()]),
         groups=len(streams),
         k_winners=first.k_winners if first.k_winners and first.k_winners < first.synapses.out_features else None,
     )
@@ -250,19 +265,15 @@ def metadata(network: FoldedNetwork) -> dict[str, Any]:
     """What a host must know to use an export, as plain values (strings, numbers, lists, dicts)."""
     config, suite = network.config, network.suite
     settings = config.network
-    neurons = network.layers[0].neurons
-    assert neurons is not None
     return {
         "method": settings.method,
         "timesteps": settings.timesteps,
         "encoding": settings.encoding,
         "readout": settings.readout,
         "readout_beta": settings.readout_beta,
-        "neuron": neurons.kind,
-        "beta": neurons.beta,
-        "threshold": neurons.threshold,
-        "reset": neurons.reset,
-        "fires_when": "membrane > threshold",
+        "reset": settings.reset if network.spiking else "none",
+        "fires_when": "membrane > threshold" if network.spiking else "never",
+        "neurons": {layer.name: layer.neurons.facts() for layer in network.layers if layer.neurons is not None},
         "tasks": list(suite.names),
         "actions": list(suite.action_names),
         "valid_actions": {

@@ -44,7 +44,8 @@ class Comparison:
     """Decisions of an engine against those of the trained network.
 
     Attributes:
-        flipped_spikes: by layer, in forward order; one spike that is there or missing, at any step.
+        spikes: by layer, in forward order: of the trained network.
+        flipped_spikes: by layer: a spike that is there in one and missing in the other, at any step.
         decisions_with_flips: decisions with at least one.
         largest_q_difference: over actions that exist.
         equal_q: decisions with bitwise equal Q.
@@ -54,6 +55,7 @@ class Comparison:
     engine: str
     task: str
     decisions: int = 0
+    spikes: dict[str, int] = field(default_factory=dict)
     flipped_spikes: dict[str, int] = field(default_factory=dict)
     decisions_with_flips: int = 0
     largest_q_difference: float = 0.0
@@ -65,6 +67,7 @@ class Comparison:
         flips_B = np.zeros(len(expected.q_BA), np.int64)
         for name in seen.spikes:
             flips_here_B = (expected.spikes[name] != seen.spikes[name]).sum(axis=(0, 2))
+            self.spikes[name] = self.spikes.get(name, 0) + int(expected.spikes[name].sum())
             self.flipped_spikes[name] = self.flipped_spikes.get(name, 0) + int(flips_here_B.sum())
             flips_B += flips_here_B
         exists = np.isfinite(expected.q_BA)

@@ -17,7 +17,7 @@ import onnx
 
 from switchmt_snn import __version__
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
-from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations
+from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, wake_silent_layers
 from switchmt_snn.export.engines import ComparedAgent, NirAgent, OnnxAgent, encode, read_nir
 from switchmt_snn.export.fold import FoldedNetwork, fold, metadata, quantized
 from switchmt_snn.export.nir_interpreter import NirInterpreter
@@ -200,6 +200,8 @@ class _Parity:
         """All comparisons as plain values; ``failures`` is empty if everything agrees as it must."""
         dyadic, real, simulators, stored = [], [], [], []
         twin = dyadic_copy(self.agent)
+        first = self.recordings[self.agent.suite.names[0]].observations
+        wake_silent_layers(twin, dyadic_observations(_spread(first, DYADIC_DECISIONS)))
         copied = self._models(fold(twin))
         written = self._written()
         for task, name in enumerate(self.agent.suite.names):

@@ -111,19 +111,24 @@ def _needs_loop(neurons: Neurons, profile: str) -> bool:
     return profile == "exact" and neurons.reset == "subtract"
 
 
-def _input_gain(neurons: Neurons | None, profile: str) -> float:
-    """Factor on the weights in front of a LIF node whose r is 1."""
+def _input_gain_O(layer: Layer, profile: str) -> Float:
+    """Factor on the weights in front of a LIF node whose r is 1, per output channel."""
+    neurons = layer.neurons
     if neurons is None or neurons.kind != "LIF" or _needs_loop(neurons, profile):
-        return 1.0
-    if neurons.beta >= 1.0:
-        raise ExportError("a LIF with beta 1 has no time constant, expected network.neuron IF")
-    return 1.0 / (1.0 - neurons.beta)
+        return np.ones(1, np.float32)
+    return (1.0 / (1.0 - _leak(neurons))).astype(np.float32)
+
+
+def _leak(neurons: Neurons) -> npt.NDArray[np.float64]:
+    if (neurons.beta_O >= 1.0).any():
+        raise ExportError("a LIF neuron has beta 1 and thus no time constant, expected beta < 1 or network.neuron IF")
+    return neurons.beta_O
 
 
 def _synapses(layer: Layer, task: int, profile: str) -> nir.NIRNode:
     weight, bias = layer.folded(task)
-    gain = np.float32(_input_gain(layer.neurons, profile))
-    weight, bias = weight * gain, bias * gain
+    gain_O = _input_gain_O(layer, profile)
+    weight, bias = weight * gain_O.reshape(-1, *(1,) * (weight.ndim - 1)), bias * gain_O
     if not layer.is_convolution:
         return nir.Affine(weight=weight, bias=bias)
     height, width = layer.input_shape[1:]
@@ -137,11 +142,11 @@ def _node(layer: Layer, nodes: dict[str, nir.NIRNode], edges: list[tuple[str, st
     """IF or LIF with parameters of the layer's full shape (importers do not broadcast)."""
     neurons, dt = cast(Neurons, layer.neurons), _DT[profile]
     name = f"{layer.name}_neurons"
-    threshold, zero = _full(layer, neurons.threshold), _full(layer, 0.0)
+    threshold, zero = _full(layer, neurons.threshold_O), _full(layer, 0.0)
     if neurons.kind == "IF":
         nodes[name] = nir.IF(r=_full(layer, 1.0 / dt), v_threshold=threshold, v_reset=zero)
     else:
-        tau = _full(layer, dt / (1.0 - neurons.beta))
+        tau = _full(layer, dt / (1.0 - _leak(neurons)))
         nodes[name] = nir.LIF(tau=tau, r=_full(layer, 1.0), v_leak=zero, v_threshold=threshold, v_reset=zero.copy())
     edges.append((layer.name, name))
 
@@ -153,17 +158,17 @@ def _loop(layer: Layer, nodes: dict[str, nir.NIRNode], edges: list[tuple[str, st
     if neurons.kind == "IF":
         nodes[membrane] = nir.I(r=_full(layer, 1.0 / dt))
     else:
-        if neurons.beta >= 1.0:
-            raise ExportError("a LIF with beta 1 has no time constant, expected network.neuron IF")
-        tau = dt / (1.0 - neurons.beta)
+        tau = dt / (1.0 - _leak(neurons))
         nodes[membrane] = nir.LI(tau=_full(layer, tau), r=_full(layer, tau / dt), v_leak=_full(layer, 0.0))
-    nodes[name] = nir.Threshold(threshold=_full(layer, neurons.threshold))
-    nodes[reset] = nir.Scale(scale=_full(layer, -neurons.threshold))
+    nodes[name] = nir.Threshold(threshold=_full(layer, neurons.threshold_O))
+    nodes[reset] = nir.Scale(scale=_full(layer, -neurons.threshold_O))
     edges += [(layer.name, membrane), (membrane, name), (name, reset), (reset, membrane)]
 
 
-def _full(layer: Layer, value: float) -> Float:
-    return np.full(layer.output_shape, value, np.float32)
+def _full(layer: Layer, value_O: npt.ArrayLike) -> Float:
+    """A parameter of every neuron of a layer, from one number or one per output channel."""
+    by_channel = np.reshape(value_O, (-1, *(1,) * (len(layer.output_shape) - 1)))
+    return np.ascontiguousarray(np.broadcast_to(by_channel, layer.output_shape), np.float32)
 
 
 def _storable(facts: dict[str, Any]) -> dict[str, Any]:

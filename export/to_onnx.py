@@ -239,13 +239,14 @@ def _fire(graph: _Graph, layer: Layer, current: str) -> str:
     """Update ``membrane_<layer>`` into ``membrane_<layer>_next`` and return the spikes (as floats)."""
     name, neurons = layer.name, layer.neurons
     assert isinstance(neurons, Neurons)
-    threshold = graph.constant(f"{name}_threshold", neurons.threshold)
+    shape = (-1, *(1,) * (len(layer.output_shape) - 1))
+    threshold = graph.constant(f"{name}_threshold", neurons.threshold_O.reshape(shape))
     u = f"membrane_{name}"
     owed = graph.add("Greater", [u, threshold], f"{name}_reset_owed")
     if neurons.reset == "zero":
         u = graph.add("Where", [owed, graph.constant("zero", 0.0), u], f"{name}_after_reset")
-    if neurons.beta != 1.0:
-        u = graph.add("Mul", [u, graph.constant(f"{name}_beta", neurons.beta)], f"{name}_decayed")
+    if neurons.kind == "LIF":
+        u = graph.add("Mul", [u, graph.constant(f"{name}_beta", neurons.beta_O.reshape(shape))], f"{name}_decayed")
     following = f"membrane_{name}_next"
     if neurons.reset == "zero":
         graph.add("Add", [u, current], following)

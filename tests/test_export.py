@@ -13,13 +13,14 @@ import pytest
 import torch
 
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations
+from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, wake_silent_layers
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_nir, read_out
 from switchmt_snn.export.fold import fold, quantized
 from switchmt_snn.export.nir_interpreter import NirInterpreter
 from switchmt_snn.export.parity import Exports, compare, is_exact, trace_torch
 from switchmt_snn.export.to_nir import can_express, nir_graph, write_nir
 from switchmt_snn.export.to_onnx import decision_model, step_model
+from switchmt_snn.spiking.neurons import SpikingLayer
 from tests.export_cases import VARIANTS, make_agent, observations
 
 
@@ -43,8 +44,15 @@ def profile_of(variant: str) -> str | None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     """A dyadic copy in three programs: every spike and every Q-value."""
-    agent = dyadic_copy(make_agent(seed, **VARIANTS[variant]))
+    agent = make_agent(seed, **VARIANTS[variant])
+    if variant == "learned":  # as after training: every layer and stream its own
+        with torch.no_grad():
+            for index, module in enumerate(m for m in agent.network.modules() if isinstance(m, SpikingLayer)):
+                module.leaky.beta.fill_(0.4 + 0.2 * index)
+                module.leaky.threshold.fill_(0.375 + 0.125 * index)
+    agent = dyadic_copy(agent)
     x = dyadic_observations(observations(agent, 24, seed))
+    wake_silent_layers(agent, x)
     written = exports(agent, profile_of(variant))
     for task in range(3):
         assert is_exact(agent, task, x)
@@ -127,7 +135,8 @@ def test_files_say_what_a_host_must_know() -> None:
     facts = {entry.key: entry.value for entry in model.metadata_props}
     assert json.loads(facts["tasks"]) == ["breakout", "asterix", "space_invaders"]
     assert (facts["method"], facts["encoding"], facts["reset"]) == ("SwitchMT", "direct", "zero")
-    assert (json.loads(facts["timesteps"]), json.loads(facts["threshold"])) == (3, 0.75)
+    assert json.loads(facts["timesteps"]) == 3
+    assert json.loads(facts["neurons"])["hidden"] == {"neuron": "IF", "beta": 1.0, "threshold": 0.75}
     assert json.loads(facts["training_step"]) == 1234
     assert model.opset_import[0].version == 18
     assert {node.op_type for node in model.graph.node} >= {"Scan", "Conv", "Gather"}
