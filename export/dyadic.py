@@ -52,22 +52,25 @@ def dyadic_copy(agent: Agent) -> Agent:
     return Agent(network, replace(agent.suite, scale=scale), agent.config, torch.device("cpu"), agent.step)
 
 
-def wake_silent_layers(agent: Agent, observations: npt.NDArray[Any]) -> None:
-    """Halve the threshold of layers in which hardly a neuron fires: a silent layer would prove nothing.
+def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]]) -> None:
+    """Halve the threshold of layers in which hardly a neuron fires in some task: a silent layer would prove nothing.
 
     Args:
         agent: a dyadic copy, changed in place.
-        observations: ``[B, *shape]`` of the first task.
+        observations_by_task: dyadic observations ``[B, *shape]`` of each task.
     """
     network = agent.network
     layers = {**dict(network.trunk.items()), **dict(network.streams.items())}
     for name, layer in layers.items():
         neurons = cast(Any, layer).neurons
         for _ in range(_MAX_HALVINGS if network.spiking else 0):
-            activity: dict[str, Tensor] = {}
-            with torch.inference_mode():
-                network.eval()(torch.from_numpy(observations), 0, activity=activity)
-            if float(activity[name].mean()) >= _MIN_RATE:
+            rates = []
+            for task, observations in enumerate(observations_by_task):
+                activity: dict[str, Tensor] = {}
+                with torch.inference_mode():
+                    network.eval()(torch.from_numpy(observations), task, activity=activity)
+                rates.append(float(activity[name].mean()))
+            if min(rates) >= _MIN_RATE:
                 break
             with torch.no_grad():
                 neurons.leaky.threshold.div_(2.0)

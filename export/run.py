@@ -104,7 +104,12 @@ def export(
     if not settings.onnx and not settings.nir:
         settings = replace(settings, onnx=True, nir=can_express(network, settings.nir_profile))
     folder = Path(out) if out is not None else run_folder.path / "export"
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(
+            f"{folder} cannot be made ({error.strerror}), expected a folder to write to; use --out"
+        ) from error
     facts = _provenance(run_folder) | {"weights": "int8" if settings.int8 else "float32"}
     files: dict[str, Path] = {}
     if settings.onnx:
@@ -200,17 +205,19 @@ class _Parity:
         """All comparisons as plain values; ``failures`` is empty if everything agrees as it must."""
         dyadic, real, simulators, stored = [], [], [], []
         twin = dyadic_copy(self.agent)
-        first = self.recordings[self.agent.suite.names[0]].observations
-        wake_silent_layers(twin, dyadic_observations(_spread(first, DYADIC_DECISIONS)))
+        exact_inputs = [
+            dyadic_observations(_spread(self.recordings[name].observations, DYADIC_DECISIONS))
+            for name in self.agent.suite.names
+        ]
+        wake_silent_layers(twin, exact_inputs)
         copied = self._models(fold(twin))
         written = self._written()
         for task, name in enumerate(self.agent.suite.names):
             observations = self.recordings[name].observations
-            exact_observations = dyadic_observations(_spread(observations, DYADIC_DECISIONS))
-            exact = is_exact(twin, task, exact_observations)
+            exact = is_exact(twin, task, exact_inputs[task])
             if not exact:
                 self.failures.append(f"{name}: the dyadic copy rounds, so it proves nothing (please report this)")
-            for comparison in compare(twin, copied, task, exact_observations):
+            for comparison in compare(twin, copied, task, exact_inputs[task]):
                 dyadic.append(comparison.to_dict() | {"exact_arithmetic": exact})
                 if exact and not self._agrees(comparison):
                     self.failures.append(
@@ -227,7 +234,7 @@ class _Parity:
             if self.settings.int8 and written.decision is not None:
                 stored.append(self._stored_integers(written.decision, name, observations))
             if copied.graphs is not None:
-                simulators += self._simulators(twin, copied.graphs[name], exact_observations, name)
+                simulators += self._simulators(twin, copied.graphs[name], exact_inputs[task], name)
         return {
             "dyadic": dyadic,
             "recorded": real,

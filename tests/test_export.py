@@ -15,7 +15,7 @@ import torch
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, wake_silent_layers
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_nir, read_out
-from switchmt_snn.export.fold import fold, quantized
+from switchmt_snn.export.fold import FoldedNetwork, fold, quantized
 from switchmt_snn.export.nir_interpreter import NirInterpreter
 from switchmt_snn.export.parity import Exports, compare, is_exact, trace_torch
 from switchmt_snn.export.to_nir import can_express, nir_graph, write_nir
@@ -52,7 +52,7 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
                 module.leaky.threshold.fill_(0.375 + 0.125 * index)
     agent = dyadic_copy(agent)
     x = dyadic_observations(observations(agent, 24, seed))
-    wake_silent_layers(agent, x)
+    wake_silent_layers(agent, [x] * 3)
     written = exports(agent, profile_of(variant))
     for task in range(3):
         assert is_exact(agent, task, x)
@@ -88,17 +88,19 @@ def test_a_batch_may_mix_tasks_and_one_file_per_task_says_the_same() -> None:
         np.testing.assert_allclose(agent.q_values(x[tasks == task], task), q[tasks == task], atol=1e-5)
 
 
+def with_wrong_layer(network: FoldedNetwork, index: int) -> FoldedNetwork:
+    """The network with all currents of one layer raised."""
+    layers = list(network.layers)
+    layers[index] = replace(layers[index], shift_KO=layers[index].shift_KO + 1.0)
+    return replace(network, layers=tuple(layers))
+
+
 def test_a_broken_export_is_caught_and_the_layer_named() -> None:
     """Parity must fail when one number of one layer is wrong."""
     agent = dyadic_copy(make_agent())
     x = observations(agent, 24)
     for index, name in enumerate(["conv1", "hidden", "head"]):
-        network = fold(agent)
-        layers = list(network.layers)
-        shift = layers[index].shift_KO.copy()
-        shift[1] += 1.0
-        layers[index] = replace(layers[index], shift_KO=shift)
-        wrong = replace(network, layers=tuple(layers))
+        wrong = with_wrong_layer(fold(agent), index)
         model = decision_model(wrong).SerializeToString()
         written = Exports(wrong, model, step_model(wrong).SerializeToString(), {"asterix": nir_graph(wrong, 1)})
         for comparison in compare(agent, written, 1, x):
