@@ -3,3 +3,7 @@
 ``fold`` makes one chain of layers of a network, ``to_onnx`` and ``to_nir`` write it, ``parity`` compares what was
 written with the trained network, and ``run`` does all of it for a run folder.
 """
+
+from switchmt_snn.export.run import ExportResult, ExportSettings, evaluate_engine, export
+
+__all__ = ["ExportResult", "ExportSettings", "evaluate_engine", "export"]

@@ -141,7 +141,8 @@ class NetworkConfig:
     dendritic_gating: Literal["max", "absolute_max"] = "max"
     """Which segment speaks: the largest response, or the one largest in absolute value (sign kept)."""
     k_winners: int | None = None
-    """Keep only the k largest gated input currents per simulation step in each stream; null keeps all."""
+    """Keep only the k largest gated input currents per simulation step in each stream (of equals the lower index); null
+    keeps all."""
     normalization: Literal["per_task", "shared"] = "per_task"
     """BatchNorm running statistics for each task, or one set for all (affine weights are always shared)."""
     normalization_momentum: float = 0.1
