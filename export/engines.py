@@ -104,11 +104,14 @@ class OnnxAgent:
         """Restart the random numbers of the ``rate`` encoding."""
         self._generator.manual_seed(seed)
 
-    def decide(self, observations: Observations, tasks_B: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[Any]]:
-        """All outputs by name; a batch may mix tasks."""
+    def decide(
+        self, observations: Observations, tasks_B: npt.NDArray[np.int64], encoded_TB: Float | None = None
+    ) -> dict[str, npt.NDArray[Any]]:
+        """All outputs by name; a batch may mix tasks. ``encoded_TB`` replaces the drawing of a random encoding."""
         fed: dict[str, Any] = {}
         if "encoded" in self._inputs:
-            fed["encoded"] = encode(self.suite, self.config, observations, self._generator)
+            drawn = encode(self.suite, self.config, observations, self._generator) if encoded_TB is None else encoded_TB
+            fed["encoded"] = np.ascontiguousarray(drawn)
         else:
             fed["observation"] = np.ascontiguousarray(observations)
         if "task" in self._inputs:

@@ -9,7 +9,9 @@ Shapes: T simulation steps, B batch (decisions), L neuron layers, A actions.
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -61,6 +63,17 @@ class Comparison:
     largest_q_difference: float = 0.0
     equal_q: int = 0
     equal_actions: int = 0
+
+    def merge(self, other: Comparison) -> None:
+        """Add the counts of other decisions."""
+        for mine, theirs in ((self.spikes, other.spikes), (self.flipped_spikes, other.flipped_spikes)):
+            for name, count in theirs.items():
+                mine[name] = mine.get(name, 0) + count
+        self.decisions += other.decisions
+        self.decisions_with_flips += other.decisions_with_flips
+        self.largest_q_difference = max(self.largest_q_difference, other.largest_q_difference)
+        self.equal_q += other.equal_q
+        self.equal_actions += other.equal_actions
 
     def add(self, expected: Trace, seen: Trace) -> None:
         """Count one batch."""
@@ -135,7 +148,6 @@ def trace_onnx(
     observations: npt.NDArray[Any],
     encoded_TB: Float,
     task: int,
-    seed: int,
 ) -> Trace:
     """``decision.onnx`` for Q and ``step.onnx`` for every spike; their spike counts must agree.
 
@@ -144,8 +156,7 @@ def trace_onnx(
     """
     batch = len(observations)
     tasks_B = np.full(batch, task)
-    decision.reseed(seed)
-    decided = decision.decide(observations, tasks_B)
+    decided = decision.decide(observations, tasks_B, encoded_TB)
     if step is None:
         return Trace(decided["q_values"], {})
     layers = network.hidden_layers
@@ -180,25 +191,39 @@ class Exports:
 
 
 def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray[Any]) -> list[Comparison]:
-    """Compare every exported model of a task with the network on some observations, chunk by chunk."""
-    name = agent.suite.names[task]
-    network = exports.network
-    decision = step = None
-    results: dict[str, Comparison] = {}
-    if exports.decision is not None:
-        decision = OnnxAgent(exports.decision, agent.suite, agent.config)
-        step = onnx_session(exports.step) if exports.step is not None else None
-        results["onnx"] = Comparison("onnx", name)
-    if exports.graphs is not None:
-        results["nir"] = Comparison("nir", name)
-    for seed, chunk in enumerate(_chunks(observations)):
-        expected = trace_torch(agent, chunk, task, seed)
+    """Compare every exported model of a task with the network on some observations.
+
+    Chunks are compared side by side on all cores; PyTorch runs on one thread meanwhile.
+    """
+    name, network = agent.suite.names[task], exports.network
+    engines = [engine for engine, there in (("onnx", exports.decision), ("nir", exports.graphs)) if there is not None]
+    decision = OnnxAgent(exports.decision, agent.suite, agent.config) if exports.decision is not None else None
+    step = onnx_session(exports.step) if exports.step is not None else None
+
+    def compared(seed: int, chunk: npt.NDArray[Any]) -> list[Comparison]:
+        # snnTorch's neurons write into themselves: every thread has a network of its own.
+        own = Agent(copy.deepcopy(agent.network), agent.suite, agent.config, agent.device, agent.step)
+        expected = trace_torch(own, chunk, task, seed)
         encoded_TB = encode(agent.suite, agent.config, chunk, seed)
-        if decision is not None:
-            results["onnx"].add(expected, trace_onnx(network, decision, step, chunk, encoded_TB, task, seed))
-        if exports.graphs is not None:
-            results["nir"].add(expected, trace_nir(network, exports.graphs[name], encoded_TB, task))
-    return list(results.values())
+        results = [Comparison(engine, name) for engine in engines]
+        for result in results:
+            if result.engine == "onnx" and decision is not None:
+                result.add(expected, trace_onnx(network, decision, step, chunk, encoded_TB, task))
+            elif exports.graphs is not None:
+                result.add(expected, trace_nir(network, exports.graphs[name], encoded_TB, task))
+        return results
+
+    totals = [Comparison(engine, name) for engine in engines]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            for results in pool.map(compared, *zip(*enumerate(_chunks(observations)), strict=True)):
+                for total, result in zip(totals, results, strict=True):
+                    total.merge(result)
+    finally:
+        torch.set_num_threads(threads)
+    return totals
 
 
 def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any]) -> bool:
