@@ -188,6 +188,8 @@ class Exports:
     decision: bytes | None = None
     step: bytes | None = None
     graphs: dict[str, nir.NIRGraph] | None = None
+    own_decisions: dict[str, bytes] = field(default_factory=dict)
+    """``decision_<task>.onnx`` by task."""
 
 
 def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray[Any]) -> list[Comparison]:
@@ -196,19 +198,24 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
     Chunks are compared side by side on all cores; PyTorch runs on one thread meanwhile.
     """
     name, network = agent.suite.names[task], exports.network
-    engines = [engine for engine, there in (("onnx", exports.decision), ("nir", exports.graphs)) if there is not None]
+    own = OnnxAgent(exports.own_decisions[name], agent.suite, agent.config) if name in exports.own_decisions else None
+    there = {"onnx": exports.decision, "onnx, one task": own, "nir": exports.graphs}
+    engines = [engine for engine, model in there.items() if model is not None]
     decision = OnnxAgent(exports.decision, agent.suite, agent.config) if exports.decision is not None else None
     step = onnx_session(exports.step) if exports.step is not None else None
 
     def compared(seed: int, chunk: npt.NDArray[Any]) -> list[Comparison]:
         # snnTorch's neurons write into themselves: every thread has a network of its own.
-        own = Agent(copy.deepcopy(agent.network), agent.suite, agent.config, agent.device, agent.step)
-        expected = trace_torch(own, chunk, task, seed)
+        mine = Agent(copy.deepcopy(agent.network), agent.suite, agent.config, agent.device, agent.step)
+        expected = trace_torch(mine, chunk, task, seed)
         encoded_TB = encode(agent.suite, agent.config, chunk, seed)
         results = [Comparison(engine, name) for engine in engines]
         for result in results:
             if result.engine == "onnx" and decision is not None:
                 result.add(expected, trace_onnx(network, decision, step, chunk, encoded_TB, task))
+            elif result.engine == "onnx, one task" and own is not None:
+                # Its spikes are not seen one by one, but counted: what differs is in Q.
+                result.add(expected, trace_onnx(network, own, None, chunk, encoded_TB, task))
             elif exports.graphs is not None:
                 result.add(expected, trace_nir(network, exports.graphs[name], encoded_TB, task))
         return results

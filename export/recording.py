@@ -52,7 +52,7 @@ def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Reco
         recording = _read(path, task, agent.suite.observation_shape)
         if len(recording.actions) >= decisions and recording.seed == config.seed:
             return recording
-    recording = _play(agent, task, decisions, config.epsilon, config.seed)
+    recording = play(agent, task, decisions, config.epsilon, config.seed)
     folder.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp.npz")
     np.savez_compressed(
@@ -78,28 +78,29 @@ def _read(path: Path, task: str, shape: tuple[int, ...]) -> Recording:
     return recording
 
 
-def _play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> Recording:
+def play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> Recording:
+    """Play at least ``decisions`` decisions of a task in :data:`COPIES` copies."""
     index, suite = agent.suite.index(task), agent.suite
     steps = -(-decisions // COPIES)
     rng = np.random.default_rng([seed, index])
     valid = np.flatnonzero(suite.valid_actions_KA[index])
     agent.reseed(seed)
-    play = Play(suite, index, COPIES)
+    copies = Play(suite, index, COPIES)
     observations = np.empty((COPIES, steps, *suite.observation_shape), suite.frame_dtype)
     actions = np.empty((COPIES, steps), np.int64)
     episodes = 0
     try:
         for step in range(steps):
-            over = np.flatnonzero(play.over)
+            over = np.flatnonzero(copies.over)
             if len(over):
-                play.begin(over, np.asarray([episode_seed(seed, index, episodes + i) for i in range(len(over))]))
+                copies.begin(over, np.asarray([episode_seed(seed, index, episodes + i) for i in range(len(over))]))
                 episodes += len(over)
             explore = rng.random(COPIES) < epsilon
             random_actions = valid[rng.integers(0, len(valid), COPIES)]
-            observations[:, step] = play.observations
-            actions[:, step] = np.where(explore, random_actions, agent.act(play.observations, index))
-            play.step(actions[:, step])
+            observations[:, step] = copies.observations
+            actions[:, step] = np.where(explore, random_actions, agent.act(copies.observations, index))
+            copies.step(actions[:, step])
     finally:
-        play.close()
+        copies.close()
     flat = observations.reshape(-1, *suite.observation_shape)
     return Recording(task, flat, actions.reshape(-1), epsilon, seed)

@@ -10,30 +10,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import nir
-import numpy as np
-import numpy.typing as npt
 import onnx
 
 from switchmt_snn import __version__
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
-from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, wake_silent_layers
-from switchmt_snn.export.engines import ComparedAgent, NirAgent, OnnxAgent, encode, read_nir
+from switchmt_snn.export.engines import ComparedAgent, NirAgent, OnnxAgent, read_nir
 from switchmt_snn.export.fold import FoldedNetwork, fold, metadata, quantized
-from switchmt_snn.export.nir_interpreter import NirInterpreter
-from switchmt_snn.export.parity import MIN_EQUAL_ACTIONS, Comparison, Exports, compare, is_exact
-from switchmt_snn.export.recording import Recording, file_name, recorded_play
-from switchmt_snn.export.simulators import SIMULATORS, simulate
+from switchmt_snn.export.parity import Exports
+from switchmt_snn.export.proof import prove
+from switchmt_snn.export.recording import file_name, recorded_play
 from switchmt_snn.export.to_nir import NirProfile, can_express, nir_graph, write_nir
 from switchmt_snn.export.to_onnx import OPSET, decision_model, step_model
-from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.learning.files import write_atomically
 from switchmt_snn.learning.run import load_agent
 from switchmt_snn.learning.run_folder import RunFolder, latest_run
 
-DYADIC_DECISIONS = 64
-SIMULATOR_DECISIONS = 32
 Note = Callable[[str], None]
 
 
@@ -123,7 +115,11 @@ def export(
         task: recorded_play(agent, run_folder.path / "recordings", task, settings.parity_decisions)
         for task in agent.suite.names
     }
-    parity = _Parity(agent, exported, files, settings, recordings).check()
+    observations = {task: recording.observations for task, recording in recordings.items()}
+    parity = prove(agent, _read_back(exported, files), observations)
+    parity["protocol"] = {
+        task: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed} for task, r in recordings.items()
+    }
     write_atomically(folder / "parity.json", json.dumps(facts | parity, indent=1).encode())
     if parity["failures"]:
         raise ParityError(
@@ -178,151 +174,24 @@ def _write_nir(network: FoldedNetwork, folder: Path, profile: NirProfile, facts:
         graph.metadata.update(facts)
         path = folder / f"{file_name(task)}.nir"
         temporary = path.with_suffix(".tmp.nir")
-        write_nir(graph, temporary)
-        temporary.rename(path)
+        try:
+            write_nir(graph, temporary)
+            temporary.rename(path)
+        finally:
+            temporary.unlink(missing_ok=True)
         beside = metadata(network) | facts | {"task": task, "profile": profile, "dt": graph.metadata["dt"]}
         write_atomically(path.with_suffix(".json"), json.dumps(beside, indent=1).encode())
         files[path.name] = path
     return files
 
 
-class _Parity:
-    """The checks of one export."""
-
-    def __init__(
-        self,
-        agent: Agent,
-        exported: FoldedNetwork,
-        files: dict[str, Path],
-        settings: ExportSettings,
-        recordings: dict[str, Recording],
-    ) -> None:
-        self.agent, self.exported, self.files, self.settings = agent, exported, files, settings
-        self.recordings = recordings
-        self.failures: list[str] = []
-
-    def check(self) -> dict[str, Any]:
-        """All comparisons as plain values; ``failures`` is empty if everything agrees as it must."""
-        dyadic, real, simulators, stored = [], [], [], []
-        twin = dyadic_copy(self.agent)
-        exact_inputs = [
-            dyadic_observations(_spread(self.recordings[name].observations, DYADIC_DECISIONS))
-            for name in self.agent.suite.names
-        ]
-        wake_silent_layers(twin, exact_inputs)
-        copied = self._models(fold(twin))
-        written = self._written()
-        for task, name in enumerate(self.agent.suite.names):
-            observations = self.recordings[name].observations
-            exact = is_exact(twin, task, exact_inputs[task])
-            if not exact:
-                self.failures.append(f"{name}: the dyadic copy rounds, so it proves nothing (please report this)")
-            for comparison in compare(twin, copied, task, exact_inputs[task]):
-                dyadic.append(comparison.to_dict() | {"exact_arithmetic": exact})
-                if exact and not self._agrees(comparison):
-                    self.failures.append(
-                        f"{name}, {comparison.engine}: not bitwise equal on exact numbers, first in layer "
-                        f"{comparison.first_difference}"
-                    )
-            for comparison in compare(self.agent, written, task, observations):
-                real.append(comparison.to_dict())
-                if not self.settings.int8 and comparison.equal_actions_share < MIN_EQUAL_ACTIONS:
-                    self.failures.append(
-                        f"{name}, {comparison.engine}: {comparison.equal_actions_share:.1%} equal actions, first "
-                        f"difference in layer {comparison.first_difference}"
-                    )
-            if self.settings.int8 and written.decision is not None:
-                stored.append(self._stored_integers(written.decision, name, observations))
-            if copied.graphs is not None:
-                simulators += self._simulators(twin, copied.graphs[name], exact_inputs[task], name)
-        return {
-            "dyadic": dyadic,
-            "recorded": real,
-            "simulators": simulators,
-            "int8_storage": stored,
-            "criteria": {"dyadic": "bitwise", "recorded_min_equal_actions": MIN_EQUAL_ACTIONS},
-            "protocol": {
-                name: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed}
-                for name, r in self.recordings.items()
-            },
-            "failures": self.failures,
-        }
-
-    def _agrees(self, comparison: Comparison) -> bool:
-        """Bitwise; where T is no power of two, the mean over T rounds, and Q is compared to rounding."""
-        T = self.agent.config.network.timesteps
-        if T & (T - 1) == 0:
-            return comparison.bitwise
-        return comparison.decisions_with_flips == 0 and comparison.largest_q_difference < 1e-5
-
-    def _models(self, network: FoldedNetwork) -> Exports:
-        """The dyadic network in the formats that were written."""
-        decision = step = graphs = None
-        if self.settings.onnx:
-            decision = decision_model(network).SerializeToString()
-            step = step_model(network).SerializeToString() if network.spiking else None
-        if self.settings.nir:
-            names = network.suite.names
-            graphs = {name: nir_graph(network, k, self.settings.nir_profile) for k, name in enumerate(names)}
-        return Exports(network, decision, step, graphs)
-
-    def _written(self) -> Exports:
-        """What lies on the disk."""
-        graphs = None
-        if self.settings.nir:
-            graphs = {name: read_nir(self.files[f"{file_name(name)}.nir"]) for name in self.agent.suite.names}
-        decision, step = (
-            self.files[name].read_bytes() if name in self.files else None for name in ("decision.onnx", "step.onnx")
-        )
-        return Exports(self.exported, decision, step, graphs)
-
-    def _stored_integers(self, decision: bytes, task: str, observations: npt.NDArray[Any]) -> dict[str, Any]:
-        """The int8 file against a float32 graph with the same rounded weights: only the storage may differ."""
-        floats = replace(
-            self.exported, layers=tuple(replace(layer, weight_steps_O=None) for layer in self.exported.layers)
-        )
-        index = self.agent.suite.index(task)
-        stored, plain = (
-            OnnxAgent(model, self.agent.suite, self.agent.config).q_values(observations, index)
-            for model in (decision, decision_model(floats).SerializeToString())
-        )
-        equal = float((stored.argmax(axis=1) == plain.argmax(axis=1)).mean())
-        if equal < MIN_EQUAL_ACTIONS:
-            self.failures.append(f"{task}: the int8 file does not decide as its own integers do ({equal:.1%})")
-        return {"task": task, "decisions": len(stored), "equal_actions_share": equal}
-
-    def _simulators(
-        self, twin: Agent, graph: nir.NIRGraph, observations: npt.NDArray[Any], task: str
-    ) -> list[dict[str, Any]]:
-        """Every installed simulator on the dyadic graph, against the interpreter under the same convention."""
-        if self.settings.nir_profile in ("exact", "legacy") or twin.config.network.neuron != "IF":
-            return []  # loops, and files for older readers, are not what these importers take
-        inputs_TB = encode(twin.suite, twin.config, _spread(observations, SIMULATOR_DECISIONS), 0)
-        rows = []
-        for name, simulator in SIMULATORS.items():
-            if not simulator.installed or (name in ("norse", "nirtorch") and float(graph.metadata["dt"]) != 1.0):
-                continue
-            expected, _ = NirInterpreter(graph, **simulator.interpreter).run(inputs_TB)
-            seen = simulate(name, graph, inputs_TB)
-            equal = bool(np.array_equal(expected, seen))
-            rows.append(
-                {
-                    "simulator": name,
-                    "task": task,
-                    "convention": simulator.convention,
-                    "decisions": inputs_TB.shape[1],
-                    "bitwise": equal,
-                }
-            )
-            if not equal:
-                self.failures.append(f"{task}, {name}: not bitwise equal under its convention ({simulator.convention})")
-        return rows
-
-
-def _spread(observations: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
-    """Some observations from all over a recording."""
-    chosen = np.linspace(0, len(observations) - 1, min(count, len(observations))).astype(np.int64)
-    return np.ascontiguousarray(observations[chosen])
+def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
+    """What lies on the disk; that, and nothing in memory, is compared."""
+    names = network.suite.names
+    graphs = {name: read_nir(files[key]) for name in names if (key := f"{file_name(name)}.nir") in files}
+    own = {name: files[key].read_bytes() for name in names if (key := f"decision_{file_name(name)}.onnx") in files}
+    decision, step = (files[key].read_bytes() if key in files else None for key in ("decision.onnx", "step.onnx"))
+    return Exports(network, decision, step, graphs or None, own)
 
 
 def evaluate_engine(

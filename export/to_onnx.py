@@ -21,6 +21,7 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from switchmt_snn.errors import ExportError
 from switchmt_snn.export.fold import FoldedNetwork, Layer, Neurons, metadata
 
 OPSET = 18
@@ -96,10 +97,10 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
     over T is Q), ``spikes_<layer>``, and ``membrane_<layer>_next``.
 
     Raises:
-        ValueError: the network does not spike.
+        ExportError: the network does not spike.
     """
     if not network.spiking:
-        raise ValueError("an ANN has no simulation steps; use decision_model")
+        raise ExportError("an ANN method has no simulation steps, expected a spiking one; use the decision graph")
     graph = _Graph()
     inputs = [helper.make_tensor_value_info("encoded", _FLOAT, ["batch", *network.encoded_shape])]
     if task is None:

@@ -68,7 +68,13 @@ def test_export_writes_checks_and_the_files_play(run: Path, capsys: pytest.Captu
     assert parity["failures"] == []
     assert all(row["bitwise"] and row["exact_arithmetic"] for row in parity["dyadic"])
     assert all(total > 0 for row in parity["dyadic"] for total in row["spikes"].values())
-    assert [row["decisions"] for row in parity["recorded"]] == [200] * 4
+    assert [(row["task"], row["engine"], row["decisions"]) for row in parity["recorded"]] == [
+        ("breakout", "onnx", 200),
+        ("breakout", "nir", 200),
+        ("asterix", "onnx", 200),
+        ("asterix", "onnx, one task", 200),
+        ("asterix", "nir", 200),
+    ]
     assert parity["protocol"]["asterix"] == {"decisions": 200, "epsilon": 0.05, "seed": 10_000}
     beside = json.loads((folder / "asterix.json").read_text())
     assert beside["task"] == "asterix"
@@ -141,13 +147,41 @@ def test_a_failed_parity_exits_1_and_names_the_layer(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A writer with a wrong threshold in one layer."""
+    from switchmt_snn.export import proof
     from switchmt_snn.export import run as command
     from switchmt_snn.export.to_onnx import decision_model, step_model
     from tests.test_export import with_wrong_layer
 
-    monkeypatch.setattr(command, "decision_model", lambda n, task=None: decision_model(with_wrong_layer(n, 1), task))
-    monkeypatch.setattr(command, "step_model", lambda n: step_model(with_wrong_layer(n, 1)))
+    for module in (command, proof):
+        monkeypatch.setattr(module, "decision_model", lambda n, task=None: decision_model(with_wrong_layer(n, 1), task))
+        monkeypatch.setattr(module, "step_model", lambda n: step_model(with_wrong_layer(n, 1)))
     _, err = call(capsys, "export", run, "--onnx", "--parity-decisions", 20, code=1)
     assert "parity failed" in err
     assert "first in layer hidden" in err
     assert json.loads((run / "export" / "parity.json").read_text())["failures"]
+
+
+def test_the_same_from_python(run: Path) -> None:
+    """A run folder, an agent and a bare network."""
+    from switchmt_snn import load_agent
+    from switchmt_snn.errors import ExportError, TaskError
+    from switchmt_snn.export import check_parity, to_nir, to_onnx
+
+    agent = load_agent(run, device="cpu")
+    from_run, from_agent = (to_onnx(source).SerializeToString() for source in (run, agent))
+    assert from_run == from_agent
+    assert to_nir(run, "asterix").metadata["task"] == "asterix"
+    assert "task" not in [value.name for value in to_onnx(agent, task="asterix").graph.input]
+    assert [value.name for value in to_onnx(run, "step").graph.input][:2] == ["encoded", "task"]
+    with pytest.raises(TaskError, match="unknown task 'pong'"):
+        to_nir(run, "pong")
+    observations = {
+        name: agent.suite.make(k, 1).reset(np.array([0]), np.array([0])) for k, name in enumerate(agent.suite.names)
+    }
+    assert check_parity(agent, observations)["failures"] == []
+    bare = agent.network
+    result = check_parity(bare, {"task_0": observations["breakout"], "task_1": observations["asterix"]})
+    assert result["failures"] == []
+    assert {row["engine"] for row in result["recorded"]} == {"onnx", "nir"}
+    with pytest.raises(ExportError, match="pass observations="):
+        check_parity(bare)

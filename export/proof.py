@@ -1,0 +1,154 @@
+"""The proof of an export: exact numbers, recorded play, stored integers, other simulators; and what failed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import nir
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, wake_silent_layers
+from switchmt_snn.export.engines import OnnxAgent, encode
+from switchmt_snn.export.fold import FoldedNetwork, fold
+from switchmt_snn.export.nir_interpreter import NirInterpreter
+from switchmt_snn.export.parity import MIN_EQUAL_ACTIONS, Comparison, Exports, compare, is_exact
+from switchmt_snn.export.simulators import SIMULATORS, simulate
+from switchmt_snn.export.to_nir import NirProfile, nir_graph
+from switchmt_snn.export.to_onnx import decision_model, step_model
+from switchmt_snn.learning.agent import Agent
+
+DYADIC_DECISIONS = 64
+SIMULATOR_DECISIONS = 32
+
+Observations = npt.NDArray[Any]
+
+
+def prove(agent: Agent, written: Exports, observations: dict[str, Observations]) -> dict[str, Any]:
+    """Compare exported models with the network that they came from.
+
+    Args:
+        agent: the trained network.
+        written: the models, as read back.
+        observations: raw observations ``[N, *shape]`` of each task.
+
+    Returns:
+        The content of ``parity.json``; ``failures`` is empty if everything agrees as it must.
+    """
+    return _Proof(agent, written, observations).check()
+
+
+class _Proof:
+    def __init__(self, agent: Agent, written: Exports, observations: dict[str, Observations]) -> None:
+        self.agent, self.written, self.observations = agent, written, observations
+        self.int8 = written.network.head.weight_steps_O is not None
+        self.failures: list[str] = []
+
+    def check(self) -> dict[str, Any]:
+        """All comparisons as plain values."""
+        dyadic, real, simulators, stored = [], [], [], []
+        names = self.agent.suite.names
+        exact_inputs = [dyadic_observations(_spread(self.observations[name], DYADIC_DECISIONS)) for name in names]
+        twin = dyadic_copy(self.agent)
+        wake_silent_layers(twin, exact_inputs)
+        copied = self._same_kinds(fold(twin))
+        for task, name in enumerate(names):
+            exact = is_exact(twin, task, exact_inputs[task])
+            if not exact:
+                self.failures.append(f"{name}: the dyadic copy rounds, so it proves nothing (please report this)")
+            for comparison in compare(twin, copied, task, exact_inputs[task]):
+                dyadic.append(comparison.to_dict() | {"exact_arithmetic": exact})
+                if exact and not self._agrees(comparison):
+                    self.failures.append(
+                        f"{name}, {comparison.engine}: not bitwise equal on exact numbers, first in layer "
+                        f"{comparison.first_difference}"
+                    )
+            for comparison in compare(self.agent, self.written, task, self.observations[name]):
+                real.append(comparison.to_dict())
+                if not self.int8 and comparison.equal_actions_share < MIN_EQUAL_ACTIONS:
+                    self.failures.append(
+                        f"{name}, {comparison.engine}: {comparison.equal_actions_share:.1%} equal actions, first "
+                        f"difference in layer {comparison.first_difference}"
+                    )
+            if self.int8 and self.written.decision is not None:
+                stored.append(self._stored_integers(self.written.decision, name))
+            if copied.graphs is not None:
+                simulators += self._simulators(twin, copied.graphs[name], exact_inputs[task], name)
+        return {
+            "dyadic": dyadic,
+            "recorded": real,
+            "simulators": simulators,
+            "int8_storage": stored,
+            "criteria": {"dyadic": "bitwise", "recorded_min_equal_actions": MIN_EQUAL_ACTIONS},
+            "failures": self.failures,
+        }
+
+    def _agrees(self, comparison: Comparison) -> bool:
+        """Bitwise; where T is no power of two, the mean over T rounds, and Q is compared to rounding."""
+        T = self.agent.config.network.timesteps
+        if T & (T - 1) == 0:
+            return comparison.bitwise
+        return comparison.decisions_with_flips == 0 and comparison.largest_q_difference < 1e-5
+
+    def _same_kinds(self, network: FoldedNetwork) -> Exports:
+        """Another network in the formats that were written."""
+        written, names = self.written, network.suite.names
+        graphs = None
+        if written.graphs is not None:
+            profile: NirProfile = str(next(iter(written.graphs.values())).metadata["profile"])  # type: ignore[assignment]
+            graphs = {name: nir_graph(network, k, profile) for k, name in enumerate(names)}
+        return Exports(
+            network,
+            decision_model(network).SerializeToString() if written.decision is not None else None,
+            step_model(network).SerializeToString() if written.step is not None else None,
+            graphs,
+            {name: decision_model(network, names.index(name)).SerializeToString() for name in written.own_decisions},
+        )
+
+    def _stored_integers(self, decision: bytes, task: str) -> dict[str, Any]:
+        """The int8 file against a float32 graph with the same rounded weights: only the storage may differ."""
+        network = self.written.network
+        floats = replace(network, layers=tuple(replace(layer, weight_steps_O=None) for layer in network.layers))
+        stored, plain = (
+            OnnxAgent(model, self.agent.suite, self.agent.config).q_values(
+                self.observations[task], self.agent.suite.index(task)
+            )
+            for model in (decision, decision_model(floats).SerializeToString())
+        )
+        equal = float((stored.argmax(axis=1) == plain.argmax(axis=1)).mean())
+        if equal < MIN_EQUAL_ACTIONS:
+            self.failures.append(f"{task}: the int8 file does not decide as its own integers do ({equal:.1%})")
+        return {"task": task, "decisions": len(stored), "equal_actions_share": equal}
+
+    def _simulators(
+        self, twin: Agent, graph: nir.NIRGraph, observations: Observations, task: str
+    ) -> list[dict[str, Any]]:
+        """Every installed simulator on the dyadic graph, against the interpreter under the same convention."""
+        if str(graph.metadata["profile"]) in ("exact", "legacy") or twin.config.network.neuron != "IF":
+            return []  # loops, and files for older readers, are not what these importers take
+        inputs_TB = encode(twin.suite, twin.config, _spread(observations, SIMULATOR_DECISIONS), 0)
+        rows = []
+        for name, simulator in SIMULATORS.items():
+            if not simulator.installed or (name in ("norse", "nirtorch") and float(graph.metadata["dt"]) != 1.0):
+                continue
+            expected, _ = NirInterpreter(graph, **simulator.interpreter).run(inputs_TB)
+            equal = bool(np.array_equal(expected, simulate(name, graph, inputs_TB)))
+            rows.append(
+                {
+                    "simulator": name,
+                    "task": task,
+                    "convention": simulator.convention,
+                    "decisions": inputs_TB.shape[1],
+                    "bitwise": equal,
+                }
+            )
+            if not equal:
+                self.failures.append(f"{task}, {name}: not bitwise equal under its convention ({simulator.convention})")
+        return rows
+
+
+def _spread(observations: Observations, count: int) -> Observations:
+    """Some observations from all over a recording."""
+    chosen = np.linspace(0, len(observations) - 1, min(count, len(observations))).astype(np.int64)
+    return np.ascontiguousarray(observations[chosen])
