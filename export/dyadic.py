@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from switchmt_snn.export.engines import encode
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.network import Stream
@@ -24,19 +25,43 @@ from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 _DYADIC_BETAS = (0.0, 0.5, 0.75, 0.875)
 """Decays whose 1 - beta is a power of two, so that tau = dt / (1 - beta) is exact, too."""
+_WEIGHT_BITS = (5, 4, 3, 2)
 _MIN_RATE = 0.01
 _MAX_HALVINGS = 6
 _ANN_WEIGHTS_PER_UNIT = 16
 """An ANN's activations grow bits layer by layer; with this many weights of +-1 per unit they stay below 2^24."""
 
 
-def dyadic_copy(agent: Agent) -> Agent:
-    """A copy of the same shape whose weights, normalisation, gains and input scale are dyadic."""
+def exact_copy(agent: Agent, observations_by_task: list[npt.NDArray[Any]]) -> tuple[Agent, bool]:
+    """A dyadic copy with as many bits as stay exact, in which no layer is silent.
+
+    Args:
+        agent: the trained network.
+        observations_by_task: dyadic observations ``[B, *shape]`` of each task.
+
+    Returns:
+        The copy, and whether nothing rounds on these observations.
+    """
+    for bits in _WEIGHT_BITS:
+        twin = dyadic_copy(agent, bits)
+        wake_silent_layers(twin, observations_by_task)
+        if all(is_exact(twin, task, x) for task, x in enumerate(observations_by_task)):
+            return twin, True
+    return twin, False
+
+
+def dyadic_copy(agent: Agent, weight_bits: int = 5) -> Agent:
+    """A copy of the same shape whose weights, normalisation, gains and input scale are dyadic.
+
+    Args:
+        agent: the trained network.
+        weight_bits: bits of a weight's magnitude, relative to the largest of its layer.
+    """
     network = copy.deepcopy(agent.network)
     with torch.no_grad():
         for module in network.modules():
             if isinstance(module, (nn.Conv2d, nn.Linear)):
-                _round_synapses(module, network.spiking)
+                _round_synapses(module, network.spiking, weight_bits)
             elif isinstance(module, TaskBatchNorm):
                 _round_normalization(module, network.spiking)
             elif isinstance(module, ActiveDendrites):
@@ -76,6 +101,44 @@ def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]
                 neurons.leaky.threshold.div_(2.0)
 
 
+def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any]) -> bool:
+    """Whether the network computes the same in float32 and in float64: then nothing was rounded.
+
+    Rounding of Q by a mean over T that is no power of two is left out; the spikes decide.
+    """
+    wide = copy.deepcopy(agent.network).double()
+    for module in wide.modules():
+        if isinstance(module, SpikingLayer):
+            module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
+    scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, 0).copy())
+    narrow_activity: dict[str, torch.Tensor] = {}
+    wide_activity: dict[str, torch.Tensor] = {}
+    narrow, wide_q = (
+        _from_encoded(network, scaled.to(dtype), task, activity)
+        for network, dtype, activity in (
+            (agent.network, torch.float32, narrow_activity),
+            (wide, torch.float64, wide_activity),
+        )
+    )
+    same = all(torch.equal(narrow_activity[name].double(), wide_activity[name]) for name in wide_activity)
+    T = agent.config.network.timesteps
+    return same and (T & (T - 1) != 0 or torch.equal(narrow.double(), wide_q))
+
+
+def _step(x: torch.Tensor) -> torch.Tensor:
+    return (x > 0).to(x.dtype)
+
+
+def _from_encoded(network: Any, encoded: torch.Tensor, task: int, activity: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Run a network on inputs that are encoded already."""
+    replaced = copy.copy(network)
+    replaced.encoder = lambda x, generator: encoded
+    replaced.observation = network.observation
+    with torch.inference_mode():
+        q: torch.Tensor = replaced.eval()(torch.zeros(1, dtype=encoded.dtype), task, activity=activity)
+    return q
+
+
 def dyadic_observations(observations: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Observations with few enough bits for exact sums: the upper four of a byte, or sixteenths within +-8."""
     if observations.dtype == np.uint8:
@@ -85,12 +148,13 @@ def dyadic_observations(observations: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _to_grid(value: Tensor, bits: int) -> Tensor:
-    return torch.round(value * float(2**bits)) / float(2**bits)
+    return torch.round(value * 2.0**bits) / 2.0**bits
 
 
-def _round_synapses(module: nn.Conv2d | nn.Linear, spiking: bool) -> None:
+def _round_synapses(module: nn.Conv2d | nn.Linear, spiking: bool, bits: int) -> None:
     if spiking:
-        module.weight.copy_(_to_grid(module.weight, 6))
+        exponent = math.ceil(math.log2(max(float(module.weight.abs().max()), 2.0**-20)))
+        module.weight.copy_(_to_grid(module.weight, bits - exponent))
     else:
         flat = module.weight.flatten(1)
         kept = torch.zeros_like(flat)

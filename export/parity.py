@@ -25,7 +25,6 @@ from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_ou
 from switchmt_snn.export.fold import FoldedNetwork
 from switchmt_snn.export.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.learning.agent import Agent
-from switchmt_snn.spiking.neurons import SpikingLayer
 
 CHUNK = 64
 """Decisions that are held in memory at once."""
@@ -231,44 +230,6 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
     finally:
         torch.set_num_threads(threads)
     return totals
-
-
-def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any]) -> bool:
-    """Whether the network computes the same in float32 and in float64: then nothing was rounded.
-
-    Rounding of Q by a mean over T that is no power of two is left out; the spikes decide.
-    """
-    wide = copy.deepcopy(agent.network).double()
-    for module in wide.modules():
-        if isinstance(module, SpikingLayer):
-            module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
-    scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, 0).copy())
-    narrow_activity: dict[str, torch.Tensor] = {}
-    wide_activity: dict[str, torch.Tensor] = {}
-    narrow, wide_q = (
-        _from_encoded(network, scaled.to(dtype), task, activity)
-        for network, dtype, activity in (
-            (agent.network, torch.float32, narrow_activity),
-            (wide, torch.float64, wide_activity),
-        )
-    )
-    same = all(torch.equal(narrow_activity[name].double(), wide_activity[name]) for name in wide_activity)
-    T = agent.config.network.timesteps
-    return same and (T & (T - 1) != 0 or torch.equal(narrow.double(), wide_q))
-
-
-def _step(x: torch.Tensor) -> torch.Tensor:
-    return (x > 0).to(x.dtype)
-
-
-def _from_encoded(network: Any, encoded: torch.Tensor, task: int, activity: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Run a network on inputs that are encoded already."""
-    replaced = copy.copy(network)
-    replaced.encoder = lambda x, generator: encoded
-    replaced.observation = network.observation
-    with torch.inference_mode():
-        q: torch.Tensor = replaced.eval()(torch.zeros(1, dtype=encoded.dtype), task, activity=activity)
-    return q
 
 
 def _chunks(observations: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:

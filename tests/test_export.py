@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,16 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from switchmt_snn.config import METHOD_TRAITS, METHODS
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, wake_silent_layers
+from switchmt_snn.export.dyadic import dyadic_copy, dyadic_observations, exact_copy
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_nir, read_out
 from switchmt_snn.export.fold import FoldedNetwork, fold, quantized
 from switchmt_snn.export.nir_interpreter import NirInterpreter
-from switchmt_snn.export.parity import Exports, compare, is_exact, trace_torch
+from switchmt_snn.export.parity import Exports, compare, trace_torch
 from switchmt_snn.export.to_nir import can_express, nir_graph, write_nir
 from switchmt_snn.export.to_onnx import decision_model, step_model
 from switchmt_snn.spiking.neurons import SpikingLayer
@@ -50,12 +54,11 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
             for index, module in enumerate(m for m in agent.network.modules() if isinstance(m, SpikingLayer)):
                 module.leaky.beta.fill_(0.4 + 0.2 * index)
                 module.leaky.threshold.fill_(0.375 + 0.125 * index)
-    agent = dyadic_copy(agent)
     x = dyadic_observations(observations(agent, 24, seed))
-    wake_silent_layers(agent, [x] * 3)
+    agent, exact = exact_copy(agent, [x] * 3)
+    assert exact
     written = exports(agent, profile_of(variant))
     for task in range(3):
-        assert is_exact(agent, task, x)
         for comparison in compare(agent, written, task, x):
             assert comparison.decisions_with_flips == 0, comparison
             tolerance = 1e-5 if variant == "T 7" else 0.0  # a mean over 7 steps rounds
@@ -63,6 +66,40 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     if agent.network.spiking:
         totals = {name: int(spikes.sum()) for name, spikes in trace_torch(agent, x, 0, 0).spikes.items()}
         assert all(total > 0 for total in totals.values()), f"a silent layer proves nothing: {totals}"
+
+
+@settings(max_examples=int(os.environ.get("EXPORT_EXAMPLES", "20")), deadline=None)
+@given(
+    method=st.sampled_from(METHODS),
+    reset=st.sampled_from(["zero", "subtract"]),
+    timesteps=st.sampled_from([1, 2, 4, 8]),
+    dendrites=st.sampled_from(["shared", "per_neuron"]),
+    encoding=st.sampled_from(["direct", "rate", "latency", "frames", "events"]),
+    neuron=st.sampled_from(["IF", "LIF"]),
+    readout=st.sampled_from(["mean", "last_membrane", "max_membrane"]),
+    normalization=st.sampled_from(["per_task", "shared"]),
+    seed=st.integers(0, 2**20),
+)
+def test_any_network_is_exported_bitwise(
+    method, reset, timesteps, dendrites, encoding, neuron, readout, normalization, seed
+) -> None:
+    """On exact numbers, whatever the combination; EXPORT_EXAMPLES=500 looks at more of them."""
+    traits = METHOD_TRAITS[method]
+    network = {"method": method, "timesteps": timesteps, "normalization": normalization}
+    if traits.spiking:
+        network |= {"reset": reset, "encoding": encoding, "neuron": neuron, "readout": readout}
+        network["tasks"] = {"frame_stack": timesteps if encoding in ("frames", "events") else 2}
+    if traits.dendrites:
+        network["dendrites"] = dendrites
+    agent = make_agent(seed, **network)
+    x = dyadic_observations(observations(agent, 6, seed))
+    agent, exact = exact_copy(agent, [x] * 3)
+    assert exact
+    profile = None if not traits.spiking else "exact" if reset == "subtract" else "portable"
+    written = exports(agent, profile)
+    for task in range(3):
+        for comparison in compare(agent, written, task, x):
+            assert comparison.bitwise, comparison
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
