@@ -1,0 +1,130 @@
+"""Exact counts of operations: NeuroBench's definitions, in integers.
+
+A synaptic operation is a non-zero input that meets a non-zero weight inside the image; padding is not counted. Dense
+operations count every input and weight. A layer whose inputs are spikes accumulates (AC), any other one multiplies and
+accumulates (MAC); that is a property of the layer, never of a batch (NeuroBench 2.3 decides by the values of a batch).
+
+Because what an input can reach depends on its position only, a count is a sum over the active inputs of their fan-out,
+an integer array made once per layer. Nothing is added up in float32.
+
+Shapes: T simulation steps, B batch (decisions), O output and I input channels or features, ... a layer's own shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Int = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Synapses:
+    """What counting needs of a layer of synapses.
+
+    Attributes:
+        weight: ``[O, I, kh, kw]`` of a convolution or ``[O, I]`` of a linear layer.
+        input_shape: ``(I, H, W)`` or ``(I,)``.
+        stride: of a convolution, ``(vertical, horizontal)``.
+        padding: of a convolution, ``(vertical, horizontal)``.
+        spiking_input: whether inputs are spikes.
+    """
+
+    name: str
+    weight: npt.NDArray[np.floating]
+    input_shape: tuple[int, ...]
+    spiking_input: bool
+    stride: tuple[int, int] = (1, 1)
+    padding: tuple[int, int] = (0, 0)
+
+    @property
+    def operation(self) -> str:
+        """``AC`` or ``MAC``."""
+        return "AC" if self.spiking_input else "MAC"
+
+    def fan_out(self) -> Int:
+        """Non-zero weights that each input meets, of the input's shape."""
+        return self._fan_out((self.weight != 0).astype(np.int64))
+
+    def dense_operations(self) -> int:
+        """Operations of one pass with every input and every weight counted."""
+        return int(self._fan_out(np.ones(self.weight.shape, np.int64)).sum())
+
+    def _fan_out(self, present: Int) -> Int:
+        if present.ndim == 2:
+            return present.sum(axis=0)
+        _, height, width = self.input_shape
+        kernel_Ikk = present.sum(axis=0)
+        _, kh, kw = kernel_Ikk.shape
+        (sy, sx), (py, px) = self.stride, self.padding
+        reached = np.zeros((len(kernel_Ikk), height + 2 * py, width + 2 * px), np.int64)
+        for y in range(0, height + 2 * py - kh + 1, sy):
+            for x in range(0, width + 2 * px - kw + 1, sx):
+                reached[:, y : y + kh, x : x + kw] += kernel_Ikk
+        return reached[:, py : py + height, px : px + width]
+
+
+class SynapseCounter:
+    """Adds up the operations of one layer over decisions; its memory does not grow with their number.
+
+    Attributes:
+        operations_T: effective operations at each simulation step.
+        active_inputs_T: non-zero inputs at each simulation step.
+        decisions: decisions seen.
+    """
+
+    def __init__(self, synapses: Synapses) -> None:
+        self.synapses = synapses
+        self.fan_out = synapses.fan_out().reshape(-1)
+        self.operations_T: Int = np.zeros(0, np.int64)
+        self.active_inputs_T: Int = np.zeros(0, np.int64)
+        self.decisions = 0
+
+    def add(self, active_TB: npt.NDArray[np.bool_]) -> None:
+        """Count a batch: which inputs ``[T, B, ...]`` are not zero."""
+        flat = active_TB.reshape(*active_TB.shape[:2], -1)
+        reached_TN = flat.sum(axis=1, dtype=np.int64)  # how often each input was active
+        if len(self.operations_T) == 0:
+            self.operations_T = np.zeros(len(flat), np.int64)
+            self.active_inputs_T = np.zeros(len(flat), np.int64)
+        self.operations_T += reached_TN @ self.fan_out
+        self.active_inputs_T += reached_TN.sum(axis=1)
+        self.decisions += flat.shape[1]
+
+
+class NeuronCounter:
+    """Adds up the spikes of one neuron layer over decisions.
+
+    Attributes:
+        spikes_TN: how often each neuron fired at each step.
+        decisions: decisions seen.
+    """
+
+    def __init__(self, name: str, shape: tuple[int, ...], timesteps: int) -> None:
+        self.name, self.shape = name, shape
+        self.spikes_TN: Int = np.zeros((timesteps, int(np.prod(shape))), np.int64)
+        self.decisions = 0
+
+    def add(self, spikes_TB: npt.NDArray[np.bool_]) -> None:
+        """Count a batch of spikes ``[T, B, ...]``."""
+        flat = spikes_TB.reshape(*spikes_TB.shape[:2], -1)
+        self.spikes_TN += flat.sum(axis=1, dtype=np.int64)
+        self.decisions += flat.shape[1]
+
+    @property
+    def rate_N(self) -> npt.NDArray[np.float64]:
+        """Spikes per neuron and simulation step."""
+        rates: npt.NDArray[np.float64] = self.spikes_TN.sum(axis=0) / max(1, self.decisions * len(self.spikes_TN))
+        return rates
+
+    @property
+    def silent(self) -> int:
+        """Neurons that never fired."""
+        return int((self.spikes_TN.sum(axis=0) == 0).sum())
+
+    @property
+    def saturated(self) -> int:
+        """Neurons that fired at every step of every decision."""
+        return int((self.spikes_TN.sum(axis=0) == self.decisions * len(self.spikes_TN)).sum())
