@@ -54,7 +54,8 @@ class Synapses:
 
     def _fan_out(self, present: Int) -> Int:
         if present.ndim == 2:
-            return present.sum(axis=0)
+            reached_I: Int = present.sum(axis=0)
+            return reached_I
         _, height, width = self.input_shape
         kernel_Ikk = present.sum(axis=0)
         _, kh, kw = kernel_Ikk.shape

@@ -86,19 +86,20 @@ def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]
     """
     network = agent.network
     layers = {**dict(network.trunk.items()), **dict(network.streams.items())}
-    for name, layer in layers.items():
-        neurons = cast(Any, layer).neurons
+    # The streams are one layer of an export, and some simulators want one threshold per layer.
+    for names in [*([name] for name in network.trunk), list(network.streams)]:
         for _ in range(_MAX_HALVINGS if network.spiking else 0):
             rates = []
             for task, observations in enumerate(observations_by_task):
                 activity: dict[str, Tensor] = {}
                 with torch.inference_mode():
                     network.eval()(torch.from_numpy(observations), task, activity=activity)
-                rates.append(float(activity[name].mean()))
+                rates += [float(activity[name].mean()) for name in names]
             if min(rates) >= _MIN_RATE:
                 break
             with torch.no_grad():
-                neurons.leaky.threshold.div_(2.0)
+                for name in names:
+                    cast(Any, layers[name]).neurons.leaky.threshold.div_(2.0)
 
 
 def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -102,6 +103,7 @@ def export(
         raise ExportError(
             f"{folder} cannot be made ({error.strerror}), expected a folder to write to; use --out"
         ) from error
+    started = time.perf_counter()
     facts = _provenance(run_folder) | {"weights": "int8" if settings.int8 else "float32"}
     files: dict[str, Path] = {}
     if settings.onnx:
@@ -110,15 +112,22 @@ def export(
         files |= _write_nir(exported, folder, settings.nir_profile, facts)
     for name, path in files.items():
         note(f"wrote {path} ({name})")
-    note("parity: comparing the files with the trained network")
+    written_at = time.perf_counter()
+    note("parity: comparing the files with the trained network on recorded play")
     recordings = {
         task: recorded_play(agent, run_folder.path / "recordings", task, settings.parity_decisions)
         for task in agent.suite.names
     }
+    recorded_at = time.perf_counter()
     observations = {task: recording.observations for task, recording in recordings.items()}
     parity = prove(agent, _read_back(exported, files), observations)
     parity["protocol"] = {
         task: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed} for task, r in recordings.items()
+    }
+    parity["wall_s"] = {
+        "write": written_at - started,
+        "record": recorded_at - written_at,
+        "parity": time.perf_counter() - recorded_at,
     }
     write_atomically(folder / "parity.json", json.dumps(facts | parity, indent=1).encode())
     if parity["failures"]:

@@ -97,7 +97,8 @@ def parity_table(parity: dict[str, Any]) -> Table:
             table.add_row(check, row["task"], row["engine"], *numbers)
     for row in parity["simulators"]:
         n = f"{row['decisions']:,}"
-        table.add_row("exact", row["task"], row["simulator"], n, "", "", "", _yes(row["bitwise"]))
+        verdict = "refused" if row["refused"] else _yes(row["bitwise"])
+        table.add_row("exact", row["task"], row["simulator"], n, "", "", "", verdict)
     return table
 
 
