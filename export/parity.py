@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -21,13 +20,12 @@ import numpy.typing as npt
 import onnxruntime
 import torch
 
+from switchmt_snn.export.activity import active_neurons, chunks
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_out
 from switchmt_snn.export.fold import FoldedNetwork
 from switchmt_snn.export.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.learning.agent import Agent
 
-CHUNK = 64
-"""Decisions that are held in memory at once."""
 MIN_EQUAL_ACTIONS = 0.99
 """On real weights, an export that agrees on fewer actions fails."""
 
@@ -114,19 +112,8 @@ class Comparison:
 
 def trace_torch(agent: Agent, observations: npt.NDArray[Any], task: int, seed: int) -> Trace:
     """The trained network itself; the streams' layers side by side as ``hidden``."""
-    activity: dict[str, torch.Tensor] = {}
-    agent.network.eval()
-    with torch.inference_mode():
-        generator = torch.Generator().manual_seed(seed)
-        q_BA = agent.network(torch.from_numpy(observations), task, activity=activity, generator=generator)
-    invalid_A = ~agent.suite.valid_actions_KA[task]
-    q = np.where(invalid_A, np.float32(-np.inf), q_BA.numpy())
-    if not agent.network.spiking:
-        return Trace(q, {})
-    parts: dict[str, list[Any]] = {}
-    for name, spikes in activity.items():
-        parts.setdefault(name if name in agent.network.trunk else "hidden", []).append(spikes.flatten(2).numpy() > 0)
-    return Trace(q, {name: np.concatenate(values, axis=2) for name, values in parts.items()})
+    activity = active_neurons(agent, observations, task, seed)
+    return Trace(activity.q_BA, activity.by_layer if agent.network.spiking else {})
 
 
 def trace_nir(network: FoldedNetwork, graph: nir.NIRGraph, encoded_TB: Float, task: int) -> Trace:
@@ -224,14 +211,9 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            for results in pool.map(compared, *zip(*enumerate(_chunks(observations)), strict=True)):
+            for results in pool.map(compared, *zip(*enumerate(chunks(observations)), strict=True)):
                 for total, result in zip(totals, results, strict=True):
                     total.merge(result)
     finally:
         torch.set_num_threads(threads)
     return totals
-
-
-def _chunks(observations: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:
-    for start in range(0, len(observations), CHUNK):
-        yield np.ascontiguousarray(observations[start : start + CHUNK])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,12 +11,12 @@ from typing import Any
 
 import onnx
 
-from switchmt_snn import __version__
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
 from switchmt_snn.export.engines import ComparedAgent, NirAgent, OnnxAgent, read_nir
 from switchmt_snn.export.fold import FoldedNetwork, fold, metadata, quantized
 from switchmt_snn.export.parity import Exports
 from switchmt_snn.export.proof import prove
+from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import file_name, recorded_play
 from switchmt_snn.export.to_nir import NirProfile, can_express, nir_graph, write_nir
 from switchmt_snn.export.to_onnx import OPSET, decision_model, step_model
@@ -104,7 +102,7 @@ def export(
             f"{folder} cannot be made ({error.strerror}), expected a folder to write to; use --out"
         ) from error
     started = time.perf_counter()
-    facts = _provenance(run_folder) | {"weights": "int8" if settings.int8 else "float32"}
+    facts = provenance(run_folder.path) | {"weights": "int8" if settings.int8 else "float32"}
     files: dict[str, Path] = {}
     if settings.onnx:
         files |= _write_onnx(exported, folder, specialised, facts)
@@ -136,25 +134,6 @@ def export(
             f"{folder / 'parity.json'}"
         )
     return ExportResult(folder, files, parity)
-
-
-def _provenance(run_folder: RunFolder) -> dict[str, Any]:
-    config = (run_folder.path / "config.yaml").read_bytes()
-    return {
-        "tool": f"switchmt-snn {__version__}",
-        "git_commit": _git_commit(),
-        "config_sha256": hashlib.sha256(config).hexdigest(),
-    }
-
-
-def _git_commit() -> str:
-    """The commit of this package's source, or ``unknown`` for an installed package."""
-    here = Path(__file__).resolve().parent
-    try:
-        found = subprocess.run(["git", "-C", here, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return found.stdout.strip() if found.returncode == 0 else "unknown"
 
 
 def _write_onnx(

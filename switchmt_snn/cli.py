@@ -24,6 +24,7 @@ usage: switchmt-snn COMMAND [options]
   train [CONFIG]      train, or continue a run (CONFIG: a YAML file or a preset; default: quickstart)
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
+  profile [RUN]       spikes and operations by layer, step and task on recorded play (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   doctor              versions, games and devices of this installation
 
@@ -92,6 +93,20 @@ class ExportOptions:
 
 
 @dataclass(frozen=True)
+class ProfileOptions:
+    """Count what a run's network does while it plays: spikes and synaptic operations, in exact integers."""
+
+    decisions: int = 1000
+    """Recorded decisions per task."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Which weights."""
+    out: Path | None = None
+    """Folder to write to. Default: the run's profile/."""
+    json: bool = False
+    """Print the profile as JSON."""
+
+
+@dataclass(frozen=True)
 class DescribeOptions:
     """Describe what a config would build; every setting of the config is an option."""
 
@@ -118,6 +133,7 @@ def _main(argv: list[str]) -> int:
         "train": _train,
         "evaluate": _evaluate,
         "export": _export,
+        "profile": _profile,
         "describe": _describe,
         "doctor": _doctor,
     }
@@ -270,6 +286,24 @@ def _export(argv: list[str]) -> int:
         print(json.dumps({"folder": str(result.folder), "files": files, "parity": result.parity}))
         return 0
     console.print(parity_table(result.parity))
+    print(result.folder)
+    return 0
+
+
+def _profile(argv: list[str]) -> int:
+    run, rest = _leading_name(argv)
+    options = _parse(ProfileOptions, rest, "profile", ProfileOptions())
+    from switchmt_snn.export.profile import profile
+    from switchmt_snn.viewing.tables import profile_table
+
+    result = profile(Path(run) if run is not None else None, options.decisions, options.checkpoint, options.out)
+    facts = result.to_dict()
+    if options.json:
+        print(json.dumps(facts))
+        return 0
+    console = Console()
+    for task in facts["tasks"]:
+        console.print(profile_table(task))
     print(result.folder)
     return 0
 

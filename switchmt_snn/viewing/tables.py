@@ -102,6 +102,22 @@ def parity_table(parity: dict[str, Any]) -> Table:
     return table
 
 
+def profile_table(task: dict[str, Any]) -> Table:
+    """What a network does per decision in one task, layer by layer (an entry of ``tasks`` in profile.json)."""
+    mean, twin = task["per_decision"], task["twins"]["ann"]["macs"]
+    facts = [f"{mean['acs']:,.0f} accumulations and {mean['macs']:,.0f} multiplications; the ANN twin multiplies"]
+    facts.append(f"{twin:,} times.")
+    if mean["neuron_updates"]:
+        facts.append(f"{mean['spikes']:,.0f} spikes, {task['spikes_per_synapse']:.3f} per synapse.")
+    table = _table(f"{task['task']}: per decision, mean of {task['decisions']:,}", " ".join(facts))
+    _add_columns(table, ("layer", "kind"), ("effective", "dense", "neurons", "rate", "silent", "saturated"))
+    for layer in task["layers"]:
+        counts = (f"{layer['effective_per_decision']:,.0f}", f"{layer['dense_per_decision']:,}")
+        neurons = (f"{layer['neurons']:,}", f"{layer['rate']:.4f}", f"{layer['silent']:,}", f"{layer['saturated']:,}")
+        table.add_row(layer["name"], layer["operation"], *counts, *(neurons if layer["neurons"] else [""] * 4))
+    return table
+
+
 def _yes(holds: bool) -> str:
     return "yes" if holds else "no"
 

@@ -1,0 +1,292 @@
+"""What a network does while it plays: spikes and operations by layer, step and task, counted on recorded decisions.
+
+Counted is the network as it is deployed: one task folded in, the head fed with every step's spikes, the first layer
+computed once per decision under direct encoding (its input does not change). Definitions: :mod:`export.counting`.
+
+Twins stand beside it: the ANN of the same shape does one multiplication per weight and position (dense), and the
+quantised ANN does the same on activations of log2(T + 1) bits, the number of values that a spike count over T can take.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.errors import ConfigError, ExportError
+from switchmt_snn.export.activity import active_neurons, chunks
+from switchmt_snn.export.counting import NeuronCounter, SynapseCounter, Synapses
+from switchmt_snn.export.engines import encode
+from switchmt_snn.export.fold import FoldedNetwork, Layer, fold
+from switchmt_snn.export.provenance import provenance
+from switchmt_snn.export.recording import recorded_play
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.files import write_atomically
+from switchmt_snn.learning.run import load_agent
+from switchmt_snn.learning.run_folder import RunFolder, latest_run
+
+SCHEMA = 1
+"""Version of :meth:`TaskProfile.to_dict`; goes up when a field changes its meaning."""
+
+
+@dataclass(frozen=True)
+class LayerProfile:
+    """Sums over all recorded decisions of one task; ``_T`` are by simulation step.
+
+    Attributes:
+        operation: what one synaptic operation is here: ``AC`` (spikes come in) or ``MAC``.
+        effective_T: synaptic operations that a non-zero input causes.
+        active_inputs_T: inputs that were not zero.
+        inputs: inputs of the layer.
+        dense_per_decision: operations of all its passes with every input and weight counted.
+        weights: its non-zero weights.
+        neurons: neurons that it feeds; 0 for the head.
+        spikes_T: spikes of those neurons (for an ANN: activations above zero).
+        silent: neurons that never fired.
+        saturated: neurons that always fired.
+        neuron_updates_per_decision: membrane updates.
+        gain_multiplications_per_decision: of the active dendrites, if they are not folded into the weights.
+    """
+
+    name: str
+    operation: str
+    decisions: int
+    effective_T: tuple[int, ...]
+    active_inputs_T: tuple[int, ...]
+    inputs: int
+    dense_per_decision: int
+    weights: int
+    neurons: int
+    spikes_T: tuple[int, ...]
+    silent: int
+    saturated: int
+    neuron_updates_per_decision: int
+    gain_multiplications_per_decision: int
+
+    @property
+    def effective_per_decision(self) -> float:
+        """Mean synaptic operations."""
+        return sum(self.effective_T) / self.decisions
+
+    @property
+    def spikes_per_decision(self) -> float:
+        """Mean spikes."""
+        return sum(self.spikes_T) / self.decisions
+
+    @property
+    def rate(self) -> float:
+        """Spikes per neuron and simulation step."""
+        steps = max(1, len(self.spikes_T))
+        return self.spikes_per_decision / (self.neurons * steps) if self.neurons else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, sums and means."""
+        return {
+            **{name: list(v) if isinstance(v, tuple) else v for name, v in vars(self).items()},
+            "effective_per_decision": self.effective_per_decision,
+            "spikes_per_decision": self.spikes_per_decision,
+            "rate": self.rate,
+        }
+
+
+@dataclass(frozen=True)
+class TaskProfile:
+    """The layers of one task, in forward order."""
+
+    task: str
+    decisions: int
+    timesteps: int
+    spiking: bool
+    layers: tuple[LayerProfile, ...]
+
+    def operations(self, kind: str) -> float:
+        """Mean effective operations per decision of a kind, ``AC`` or ``MAC``."""
+        return sum(layer.effective_per_decision for layer in self.layers if layer.operation == kind)
+
+    @property
+    def dense_macs_of_ann_twin(self) -> int:
+        """Multiplications of the ANN of the same shape: every weight at every position, once."""
+        return sum(layer.dense_per_decision // max(1, len(layer.effective_T)) for layer in self.layers)
+
+    @property
+    def spikes(self) -> float:
+        """Mean spikes per decision."""
+        return sum(layer.spikes_per_decision for layer in self.layers)
+
+    @property
+    def spikes_per_synapse(self) -> float:
+        """Accumulations per synapse and decision, over the layers that spikes feed (break-even: 0.15 to 1.38,
+        Dampfhoffer et al., IEEE TETCI 7(3):731, 2023)."""
+        fed = [layer for layer in self.layers if layer.operation == "AC"]
+        synapses = sum(layer.dense_per_decision / max(1, len(layer.effective_T)) for layer in fed)
+        return sum(layer.effective_per_decision for layer in fed) / synapses if fed else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        macs = self.dense_macs_of_ann_twin
+        return {
+            "task": self.task,
+            "decisions": self.decisions,
+            "per_decision": {
+                "spikes": self.spikes,
+                "acs": self.operations("AC"),
+                "macs": self.operations("MAC"),
+                "dense": sum(layer.dense_per_decision for layer in self.layers),
+                "neuron_updates": sum(layer.neuron_updates_per_decision for layer in self.layers),
+                "gain_multiplications": sum(layer.gain_multiplications_per_decision for layer in self.layers),
+            },
+            "spikes_per_synapse": self.spikes_per_synapse,
+            "twins": {
+                "ann": {"macs": macs},
+                "quantised_ann": {"macs": macs, "activation_bits": math.log2(self.timesteps + 1)},
+            },
+            "layers": [layer.to_dict() for layer in self.layers],
+        }
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A run's profile: its tasks, and where the numbers come from."""
+
+    folder: Path
+    facts: dict[str, Any]
+    tasks: tuple[TaskProfile, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``profile.json``."""
+        return {"schema": SCHEMA, **self.facts, "tasks": [task.to_dict() for task in self.tasks]}
+
+
+def profile(
+    run: str | Path | None = None, decisions: int = 1000, checkpoint: str = "last", out: str | Path | None = None
+) -> Profile:
+    """Count what a run's network does on recorded decisions of each task; write ``profile.json`` and ``layers.csv``.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        decisions: recorded decisions per task, at least.
+        checkpoint: ``last`` or ``best``.
+        out: where; None takes the run's ``profile/`` folder.
+
+    Raises:
+        ConfigError: fewer than one decision.
+        ExportError: recorded play that cannot be read or does not fit.
+    """
+    if decisions < 1:
+        raise ConfigError(f"decisions is {decisions}, expected at least 1")
+    run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    agent = load_agent(run_folder.path, checkpoint, "cpu")
+    folder = Path(out) if out is not None else run_folder.path / "profile"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(f"{folder} cannot be made ({error.strerror}), expected a folder; use --out") from error
+    recordings = [recorded_play(agent, run_folder.path / "recordings", name, decisions) for name in agent.suite.names]
+    tasks = tuple(profile_task(agent, k, recording.observations) for k, recording in enumerate(recordings))
+    settings = agent.config.network
+    facts = {
+        **provenance(run_folder.path),
+        "method": settings.method,
+        "encoding": settings.encoding,
+        "timesteps": settings.timesteps,
+        "training_step": agent.step,
+        "protocol": {r.task: {"epsilon": r.epsilon, "seed": r.seed} for r in recordings},
+    }
+    result = Profile(folder, facts, tasks)
+    write_atomically(folder / "profile.json", json.dumps(result.to_dict(), indent=1).encode())
+    write_atomically(folder / "layers.csv", _layers_csv(tasks).encode())
+    return result
+
+
+def _layers_csv(tasks: tuple[TaskProfile, ...]) -> str:
+    """One row per task, layer and simulation step."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["task", "layer", "operation", "step", "decisions", "effective", "active_inputs", "spikes"])
+    for task in tasks:
+        for layer in task.layers:
+            # Under direct encoding the first layer's synapses work once, its neurons at every step.
+            columns = (layer.effective_T, layer.active_inputs_T, layer.spikes_T)
+            for step, counts in enumerate(itertools.zip_longest(*columns, fillvalue=0)):
+                writer.writerow([task.task, layer.name, layer.operation, step, layer.decisions, *counts])
+    return text.getvalue()
+
+
+def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> TaskProfile:
+    """Count one task's recorded decisions; memory does not grow with their number.
+
+    Args:
+        agent: the trained network.
+        task: task index.
+        observations: raw observations ``[N, *shape]``.
+
+    Raises:
+        ExportError: no decisions, or observations of another shape.
+    """
+    expected = agent.suite.observation_shape
+    if len(observations) == 0 or observations.shape[1:] != expected:
+        raise ExportError(
+            f"the recorded observations have shape {observations.shape}, expected (N, {', '.join(map(str, expected))}) "
+            "with N >= 1; record them again"
+        )
+    network = fold(agent)
+    settings = agent.config.network
+    synapses = [SynapseCounter(_synapses(network, layer, task)) for layer in network.layers]
+    steps = settings.timesteps
+    neurons = [NeuronCounter(layer.name, layer.output_shape, steps) for layer in network.hidden_layers]
+    for seed, chunk in enumerate(chunks(observations)):
+        encoded_TB = encode(agent.suite, agent.config, chunk, seed)
+        once = settings.encoding == "direct"
+        active = active_neurons(agent, chunk, task, seed).by_layer
+        inputs = [encoded_TB[:1] != 0 if once else encoded_TB != 0, *active.values()]
+        for counter, fed in zip(synapses, inputs, strict=True):
+            counter.add(fed)
+        for neuron_counter, fired in zip(neurons, active.values(), strict=True):
+            neuron_counter.add(fired)
+    layers = []
+    for index, (layer, counter) in enumerate(zip(network.layers, synapses, strict=True)):
+        layers.append(_layer_profile(network, layer, counter, neurons[index] if index < len(neurons) else None))
+    return TaskProfile(agent.suite.names[task], len(observations), steps, network.spiking, tuple(layers))
+
+
+def _synapses(network: FoldedNetwork, layer: Layer, task: int) -> Synapses:
+    first = layer is network.layers[0]
+    spikes_in = network.config.network.encoding in ("rate", "latency", "events") if first else network.spiking
+    weight, _ = layer.folded(task)
+    stride = layer.stride or 1
+    shape = layer.input_shape
+    if not layer.is_convolution and len(shape) > 1:  # an image into a linear layer
+        shape = (int(np.prod(shape)),)
+    return Synapses(layer.name, weight, shape, spikes_in, stride=(stride, stride))
+
+
+def _layer_profile(
+    network: FoldedNetwork, layer: Layer, counter: SynapseCounter, neurons: NeuronCounter | None
+) -> LayerProfile:
+    steps = network.config.network.timesteps
+    count = int(np.prod(layer.output_shape)) if neurons is not None else 0
+    gated = network.config.network.dendrites in ("shared", "per_neuron") and layer.name == "hidden"
+    return LayerProfile(
+        name=layer.name,
+        operation=counter.synapses.operation,
+        decisions=counter.decisions,
+        effective_T=tuple(counter.operations_T.tolist()),
+        active_inputs_T=tuple(counter.active_inputs_T.tolist()),
+        inputs=len(counter.fan_out),
+        dense_per_decision=counter.synapses.dense_operations() * len(counter.operations_T),
+        weights=int(np.count_nonzero(counter.synapses.weight)),
+        neurons=count,
+        spikes_T=tuple(neurons.spikes_TN.sum(axis=1).tolist()) if neurons is not None else (),
+        silent=neurons.silent if neurons is not None else 0,
+        saturated=neurons.saturated if neurons is not None else 0,
+        neuron_updates_per_decision=count * steps if network.spiking else 0,
+        gain_multiplications_per_decision=count * steps if gated else 0,
+    )

@@ -1,0 +1,132 @@
+"""Profiles: every count against an independent one, made of hooks on the network's own layers."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from switchmt_snn.config import METHOD_TRAITS
+from switchmt_snn.errors import ExportError
+from switchmt_snn.export.profile import profile_task
+from tests.export_cases import VARIANTS, make_agent, observations
+from tests.test_export_command import call, run, trained  # noqa: F401
+
+
+def hooked_counts(agent, x: np.ndarray, task: int) -> dict[str, int]:
+    """Operations of the synaptic modules on the inputs that they really get, as a pass of ones over them."""
+    counts: dict[str, int] = {}
+
+    def hook(name: str):
+        def count(module, inputs, output) -> None:
+            present = (inputs[0] != 0).double()
+            weight = (module.weight != 0).double()
+            if isinstance(module, nn.Conv2d):
+                counts[name] = counts.get(name, 0) + int(F.conv2d(present, weight, stride=module.stride).sum())
+            else:
+                counts[name] = counts.get(name, 0) + int(F.linear(present, weight).sum())
+
+        return count
+
+    handles = []
+    for layer in agent.network.trunk:
+        synapses = agent.network.trunk[layer].synapses
+        module = synapses[-1] if isinstance(synapses, nn.Sequential) else synapses
+        handles.append(module.register_forward_hook(hook(layer)))
+    for stream in agent.network.streams.values():
+        handles.append(stream.synapses.register_forward_hook(hook("hidden")))
+    with torch.no_grad():
+        agent.network.eval()(torch.from_numpy(x), task, generator=torch.Generator().manual_seed(0))
+    for handle in handles:
+        handle.remove()
+    return counts
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_counts_equal_hooks_on_the_network(variant: str) -> None:
+    agent = make_agent(**VARIANTS[variant])
+    with torch.no_grad():  # some weights pruned
+        for module in agent.network.modules():
+            if isinstance(module, (nn.Conv2d, nn.Linear)):
+                module.weight *= torch.rand_like(module.weight) > 0.3
+    x = observations(agent, 60)
+    for task in range(3):
+        profile = profile_task(agent, task, x)
+        expected = hooked_counts(agent, x, task)
+        seen = {layer.name: sum(layer.effective_T) for layer in profile.layers}
+        for name, count in expected.items():
+            assert seen[name] == count, (name, task)
+        activity: dict[str, torch.Tensor] = {}
+        with torch.no_grad():
+            generator = torch.Generator().manual_seed(0)
+            agent.network.eval()(torch.from_numpy(x), task, activity=activity, generator=generator)
+        by_layer: dict[str, int] = {}
+        for name, values in activity.items():
+            layer = name if name in agent.network.trunk else "hidden"
+            by_layer[layer] = by_layer.get(layer, 0) + int((values != 0).sum())
+        assert {layer.name: sum(layer.spikes_T) for layer in profile.layers if layer.neurons} == by_layer
+
+
+def test_what_is_a_multiplication_and_what_an_accumulation() -> None:
+    def kinds(variant: str) -> list[str]:
+        agent = make_agent(**VARIANTS[variant])
+        return [layer.operation for layer in profile_task(agent, 0, observations(agent, 5)).layers]
+
+    assert kinds("SwitchMT") == ["MAC", "AC", "AC"]
+    assert kinds("frames") == ["MAC", "AC", "AC"]
+    for spikes_in in ("rate", "latency", "events"):
+        assert kinds(spikes_in) == ["AC", "AC", "AC"]
+    for method, traits in METHOD_TRAITS.items():
+        assert traits.spiking or kinds(method) == ["MAC", "MAC", "MAC"]
+
+
+def test_sums_do_not_depend_on_the_chunks_or_the_batch() -> None:
+    agent = make_agent()
+    x = observations(agent, 130)
+    whole = profile_task(agent, 1, x)
+    parts = [profile_task(agent, 1, part) for part in (x[:64], x[64:65], x[65:])]
+    for index, layer in enumerate(whole.layers):
+        assert sum(sum(part.layers[index].effective_T) for part in parts) == sum(layer.effective_T)
+        assert sum(sum(part.layers[index].spikes_T) for part in parts) == sum(layer.spikes_T)
+    assert whole.layers[0].dense_per_decision == 16 * 6 * 9 * 64  # out x channels x kernel x positions, once
+    assert whole.layers[1].dense_per_decision == 4 * 1024 * 64  # T x inputs x both streams
+
+
+def test_the_ann_twin_is_the_dense_network_once() -> None:
+    spiking, ann = (make_agent(method=method) for method in ("SwitchMT", "DQN_D"))
+    x = observations(spiking, 5)
+    macs = 16 * 6 * 9 * 64 + 1024 * 64 + 64 * 6
+    assert profile_task(spiking, 0, x).dense_macs_of_ann_twin == macs
+    assert sum(layer.dense_per_decision for layer in profile_task(ann, 0, x).layers) == macs
+
+
+def test_wrong_observations_are_refused() -> None:
+    agent = make_agent()
+    for wrong in (np.zeros((0, *agent.suite.observation_shape), np.uint8), np.zeros((3, 2, 10, 10), np.uint8)):
+        with pytest.raises(ExportError, match="recorded observations have shape"):
+            profile_task(agent, 0, wrong)
+
+
+def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    out, _ = call(capsys, "profile", run, "--decisions", 50)
+    assert "breakout: per decision, mean of 52" in out
+    facts = json.loads((run / "profile" / "profile.json").read_text())
+    assert facts["schema"] == 1
+    with (run / "profile" / "layers.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for task in facts["tasks"]:
+        mine = [row for row in rows if row["task"] == task["task"]]
+        assert sum(int(row["effective"]) for row in mine) / 52 == pytest.approx(
+            task["per_decision"]["acs"] + task["per_decision"]["macs"]
+        )
+        assert sum(int(row["spikes"]) for row in mine) / 52 == pytest.approx(task["per_decision"]["spikes"])
+    out, _ = call(capsys, "profile", run, "--decisions", 50, "--json")
+    assert json.loads(out) == facts
+    _, err = call(capsys, "profile", run, "--decisions", 0, code=2)
+    assert "decisions is 0, expected at least 1" in err
