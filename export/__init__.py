@@ -5,6 +5,17 @@ written with the trained network, and ``run`` does all of it for a run folder.
 """
 
 from switchmt_snn.export.api import check_parity, to_nir, to_onnx
+from switchmt_snn.export.profiling import Profile, profile
 from switchmt_snn.export.run import ExportResult, ExportSettings, evaluate_engine, export
 
-__all__ = ["ExportResult", "ExportSettings", "check_parity", "evaluate_engine", "export", "to_nir", "to_onnx"]
+__all__ = [
+    "ExportResult",
+    "ExportSettings",
+    "Profile",
+    "check_parity",
+    "evaluate_engine",
+    "export",
+    "profile",
+    "to_nir",
+    "to_onnx",
+]

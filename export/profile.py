@@ -9,32 +9,19 @@ quantised ANN does the same on activations of log2(T + 1) bits, the number of va
 
 from __future__ import annotations
 
-import csv
-import io
-import itertools
-import json
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.errors import ConfigError, ExportError
+from switchmt_snn.errors import ExportError
 from switchmt_snn.export.activity import active_neurons, chunks
 from switchmt_snn.export.counting import NeuronCounter, SynapseCounter, Synapses
 from switchmt_snn.export.engines import encode
 from switchmt_snn.export.fold import FoldedNetwork, Layer, fold
-from switchmt_snn.export.provenance import provenance
-from switchmt_snn.export.recording import recorded_play
 from switchmt_snn.learning.agent import Agent
-from switchmt_snn.learning.files import write_atomically
-from switchmt_snn.learning.run import load_agent
-from switchmt_snn.learning.run_folder import RunFolder, latest_run
-
-SCHEMA = 1
-"""Version of :meth:`TaskProfile.to_dict`; goes up when a field changes its meaning."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +29,7 @@ class LayerProfile:
     """Sums over all recorded decisions of one task; ``_T`` are by simulation step.
 
     Attributes:
+        convolution: whether its synapses are a convolution.
         operation: what one synaptic operation is here: ``AC`` (spikes come in) or ``MAC``.
         effective_T: synaptic operations that a non-zero input causes.
         active_inputs_T: inputs that were not zero.
@@ -57,6 +45,7 @@ class LayerProfile:
     """
 
     name: str
+    convolution: bool
     operation: str
     decisions: int
     effective_T: tuple[int, ...]
@@ -152,74 +141,6 @@ class TaskProfile:
         }
 
 
-@dataclass(frozen=True)
-class Profile:
-    """A run's profile: its tasks, and where the numbers come from."""
-
-    folder: Path
-    facts: dict[str, Any]
-    tasks: tuple[TaskProfile, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The content of ``profile.json``."""
-        return {"schema": SCHEMA, **self.facts, "tasks": [task.to_dict() for task in self.tasks]}
-
-
-def profile(
-    run: str | Path | None = None, decisions: int = 1000, checkpoint: str = "last", out: str | Path | None = None
-) -> Profile:
-    """Count what a run's network does on recorded decisions of each task; write ``profile.json`` and ``layers.csv``.
-
-    Args:
-        run: run folder; None takes the newest under ``runs/``.
-        decisions: recorded decisions per task, at least.
-        checkpoint: ``last`` or ``best``.
-        out: where; None takes the run's ``profile/`` folder.
-
-    Raises:
-        ConfigError: fewer than one decision.
-        ExportError: recorded play that cannot be read or does not fit.
-    """
-    if decisions < 1:
-        raise ConfigError(f"decisions is {decisions}, expected at least 1")
-    run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
-    agent = load_agent(run_folder.path, checkpoint, "cpu")
-    folder = Path(out) if out is not None else run_folder.path / "profile"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExportError(f"{folder} cannot be made ({error.strerror}), expected a folder; use --out") from error
-    recordings = [recorded_play(agent, run_folder.path / "recordings", name, decisions) for name in agent.suite.names]
-    tasks = tuple(profile_task(agent, k, recording.observations) for k, recording in enumerate(recordings))
-    settings = agent.config.network
-    facts = {
-        **provenance(run_folder.path),
-        "method": settings.method,
-        "encoding": settings.encoding,
-        "timesteps": settings.timesteps,
-        "training_step": agent.step,
-        "protocol": {r.task: {"epsilon": r.epsilon, "seed": r.seed} for r in recordings},
-    }
-    result = Profile(folder, facts, tasks)
-    write_atomically(folder / "profile.json", json.dumps(result.to_dict(), indent=1).encode())
-    write_atomically(folder / "layers.csv", _layers_csv(tasks).encode())
-    return result
-
-
-def _layers_csv(tasks: tuple[TaskProfile, ...]) -> str:
-    """One row per task, layer and simulation step."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["task", "layer", "operation", "step", "decisions", "effective", "active_inputs", "spikes"])
-    for task in tasks:
-        for layer in task.layers:
-            # Under direct encoding the first layer's synapses work once, its neurons at every step.
-            columns = (layer.effective_T, layer.active_inputs_T, layer.spikes_T)
-            for step, counts in enumerate(itertools.zip_longest(*columns, fillvalue=0)):
-                writer.writerow([task.task, layer.name, layer.operation, step, layer.decisions, *counts])
-    return text.getvalue()
-
-
 def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> TaskProfile:
     """Count one task's recorded decisions; memory does not grow with their number.
 
@@ -276,6 +197,7 @@ def _layer_profile(
     gated = network.config.network.dendrites in ("shared", "per_neuron") and layer.name == "hidden"
     return LayerProfile(
         name=layer.name,
+        convolution=layer.is_convolution,
         operation=counter.synapses.operation,
         decisions=counter.decisions,
         effective_T=tuple(counter.operations_T.tolist()),

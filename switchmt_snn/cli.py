@@ -24,7 +24,7 @@ usage: switchmt-snn COMMAND [options]
   train [CONFIG]      train, or continue a run (CONFIG: a YAML file or a preset; default: quickstart)
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
-  profile [RUN]       spikes and operations by layer, step and task on recorded play (default: newest run)
+  profile [RUN]       spikes, operations and energy by layer and task on recorded play (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   doctor              versions, games and devices of this installation
 
@@ -94,10 +94,12 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class ProfileOptions:
-    """Count what a run's network does while it plays: spikes and synaptic operations, in exact integers."""
+    """Count what a run's network does while it plays, in exact integers, and estimate its energy."""
 
     decisions: int = 1000
     """Recorded decisions per task."""
+    target: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A built-in target or a YAML file; may be given several times. Default: all built-in ones."""
     checkpoint: Literal["last", "best"] = "last"
     """Which weights."""
     out: Path | None = None
@@ -293,17 +295,20 @@ def _export(argv: list[str]) -> int:
 def _profile(argv: list[str]) -> int:
     run, rest = _leading_name(argv)
     options = _parse(ProfileOptions, rest, "profile", ProfileOptions())
-    from switchmt_snn.export.profile import profile
-    from switchmt_snn.viewing.tables import profile_table
+    from switchmt_snn.export import profile
+    from switchmt_snn.viewing.tables import energy_table, profile_table
 
-    result = profile(Path(run) if run is not None else None, options.decisions, options.checkpoint, options.out)
+    path = Path(run) if run is not None else None
+    result = profile(path, options.decisions, options.checkpoint, options.out, options.target)
     facts = result.to_dict()
     if options.json:
         print(json.dumps(facts))
         return 0
     console = Console()
+    console.print(facts["headline"], soft_wrap=True)
     for task in facts["tasks"]:
         console.print(profile_table(task))
+    console.print(energy_table(facts))
     print(result.folder)
     return 0
 

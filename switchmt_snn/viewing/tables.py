@@ -118,6 +118,37 @@ def profile_table(task: dict[str, Any]) -> Table:
     return table
 
 
+def energy_table(profile: dict[str, Any]) -> Table:
+    """Energy per decision by target and task (the content of profile.json)."""
+    tasks = profile["tasks"]
+    table = _table(
+        "Energy per decision in µJ: compute, and memory where the target has a memory model",
+        "x ANN: by the ANN of the same shape on the same target, over the tasks; x QANN: by the same with activations "
+        "of log2(T + 1) bits; above 1 the spiking network costs more. * something counted has no price there (see not_included in profile.json; usually the first layer's "
+        "multiplications). Constants, sources and what they leave out: profile.json.",
+    )
+    _add_columns(table, ("target", "evidence"), (*(task["task"] for task in tasks), "x ANN", "x QANN"))
+    for index, target in enumerate(profile["targets"].values()):
+        rows = [task["energy"][index] for task in tasks]
+        cells = [f"{_three_digits(row['total_pj'] / 1e6)}{'*' if row['not_included'] else ''}" for row in rows]
+        ratios = [
+            _range([row[twin] for row in rows if row[twin] is not None]) for twin in ("by_ann", "by_quantised_ann")
+        ]
+        table.add_row(target["name"], target["evidence"], *cells, *ratios)
+    return table
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _range(values: list[float]) -> str:
+    if not values:
+        return ""
+    low, high = f"{min(values):.2f}", f"{max(values):.2f}"
+    return low if low == high else f"{low}-{high}"
+
+
 def _yes(holds: bool) -> str:
     return "yes" if holds else "no"
 
