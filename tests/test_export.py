@@ -138,9 +138,12 @@ def test_a_broken_export_is_caught_and_the_layer_named() -> None:
     x = observations(agent, 24)
     for index, name in enumerate(["conv1", "hidden", "head"]):
         wrong = with_wrong_layer(fold(agent), index)
-        model = decision_model(wrong).SerializeToString()
-        written = Exports(wrong, model, step_model(wrong).SerializeToString(), {"asterix": nir_graph(wrong, 1)})
-        for comparison in compare(agent, written, 1, x):
+        model, own = (decision_model(wrong, task).SerializeToString() for task in (None, 1))
+        graphs = {"asterix": nir_graph(wrong, 1)}
+        written = Exports(wrong, model, step_model(wrong).SerializeToString(), graphs, {"asterix": own})
+        comparisons = compare(agent, written, 1, x)
+        assert [comparison.engine for comparison in comparisons] == ["onnx", "onnx, one task", "nir"]
+        for comparison in comparisons:
             assert not comparison.bitwise
             assert comparison.first_difference == name
 
