@@ -209,12 +209,14 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> No
     if config.name == "quickstart" and config.tasks.suite == "atari":
         lines.append(
             "This run shows the machinery; it is far too short to learn Atari. What learns: 'switchmt-snn train "
-            "minatar' on a CPU (34 minutes where measured; scores: results/minatar/README.md; extra: minatar); "
+            "minatar' on a CPU (21 minutes where measured; scores: results/minatar/README.md; extra: minatar); "
             "'switchmt-snn train paper' is meant for a GPU (its time is not measured yet)."
         )
     lines += [
         "Next:",
         f"  switchmt-snn evaluate {path} --episodes 30",
+        f"  switchmt-snn export {path}",
+        f"  switchmt-snn profile {path}",
         f"  switchmt-snn train --run {path} --total-steps {2 * config.total_steps}",
         "  switchmt-snn describe",
     ]

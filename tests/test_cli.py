@@ -186,9 +186,14 @@ def test_command_line_surface_is_frozen(capsys) -> None:
         flags = set(re.findall(r"(?<![\w-])--(?!no-)[a-z][\w.-]*", out))
         fields = {"--" + key.replace("_", "-") for _, _, rows in field_documentation() for key, *_ in rows}
         assert fields | own <= flags | {"--tasks.fire-on-reset"}, (fields | own) - flags
-    _, out, _ = call(capsys, "evaluate", "--help")
-    for flag in ("--episodes", "--epsilon", "--seed", "--num-envs", "--task", "--checkpoint", "--json"):
-        assert flag in out
+    own_flags = {
+        "evaluate": "--episodes --epsilon --seed --num-envs --task --checkpoint --engine --json",
+        "export": "--onnx --nir --task --int8 --nir-profile --parity-decisions --checkpoint --out --json",
+        "profile": "--decisions --target --checkpoint --out --json",
+    }
+    for command, flags_text in own_flags.items():
+        _, out, _ = call(capsys, command, "--help")
+        assert set(flags_text.split()) <= set(re.findall(r"--[a-z][\w-]*", out)), command
 
 
 def test_help_version_doctor(capsys) -> None:

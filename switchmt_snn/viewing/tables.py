@@ -84,16 +84,23 @@ def parity_table(parity: dict[str, Any]) -> Table:
     """What ``export`` compared: exact numbers, recorded play, other simulators (the content of parity.json)."""
     table = _table(
         "Parity with the trained network",
-        "exact: a copy whose sums do not round; recorded: real weights and play, where rounding near a threshold may "
-        "flip a spike (flips: decisions with at least one). Bitwise: every spike and every Q-value.",
+        "exact: a copy whose sums do not round. play: real weights on recorded play, where rounding near a threshold "
+        "may flip a spike; flips: decisions with at least one, actions: share of equal ones, |dQ|: largest difference. "
+        "bitwise: every spike and every Q-value.",
     )
-    _add_columns(table, ("check", "task", "engine"), ("n", "flips", "max |dQ|", "same action", "bitwise"))
-    for check, rows in (("exact", parity["dyadic"]), ("recorded", parity["recorded"])):
+    _add_columns(table, ("check", "task", "engine"), ("n", "flips", "|dQ|", "actions", "bitwise"))
+    for check, rows in (("exact", parity["dyadic"]), ("play", parity["recorded"])):
         for row in rows:
             share, flips = row["equal_actions_share"], row["decisions_with_flips"]
             flipped = f"{flips:,}" if row["flipped_spikes"] else "-"
             difference = f"{row['largest_q_difference']:.1e}" if row["largest_q_difference"] else "0"
-            numbers = (f"{row['decisions']:,}", flipped, difference, f"{share:.2%}", _yes(row["bitwise"]))
+            numbers = (
+                f"{row['decisions']:,}",
+                flipped,
+                difference,
+                f"{share:.1%}" if share < 1 else "all",
+                _yes(row["bitwise"]),
+            )
             table.add_row(check, row["task"], row["engine"], *numbers)
     for row in parity["simulators"]:
         n = f"{row['decisions']:,}"
@@ -123,31 +130,25 @@ def energy_table(profile: dict[str, Any]) -> Table:
     tasks = profile["tasks"]
     table = _table(
         "Energy per decision in µJ: compute, and memory where the target has a memory model",
-        "x ANN: by the ANN of the same shape on the same target, over the tasks; x QANN: by the same with activations "
-        "of log2(T + 1) bits; above 1 the spiking network costs more. * something counted has no price there (see "
+        "x ANN: by the ANN of the same shape on the same target, the task with the most; x QANN: by the same with "
+        "activations of log2(T + 1) bits; above 1 the spiking network costs more. * something counted has no price there (see "
         "not_included in profile.json; usually the first layer's multiplications). Constants, sources and what they "
-        "leave out: profile.json.",
+        "leave out: profile.json. How: est(imated), sim(ulated), rep(orted in a survey), mea(sured).",
     )
-    _add_columns(table, ("target", "evidence"), (*(task["task"] for task in tasks), "x ANN", "x QANN"))
+    _add_columns(table, ("target", "how"), (*(task["task"] for task in tasks), "x ANN", "x QANN"))
     for index, target in enumerate(profile["targets"].values()):
         rows = [task["energy"][index] for task in tasks]
         cells = [f"{_three_digits(row['total_pj'] / 1e6)}{'*' if row['not_included'] else ''}" for row in rows]
-        ratios = [
-            _range([row[twin] for row in rows if row[twin] is not None]) for twin in ("by_ann", "by_quantised_ann")
-        ]
-        table.add_row(target["name"], target["evidence"], *cells, *ratios)
+        ratios = []
+        for twin in ("by_ann", "by_quantised_ann"):
+            known = [row[twin] for row in rows if row[twin] is not None]
+            ratios.append(f"{max(known):.2f}" if known else "")
+        table.add_row(target["name"], target["evidence"][:3] + ".", *cells, *ratios)
     return table
 
 
 def _three_digits(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def _range(values: list[float]) -> str:
-    if not values:
-        return ""
-    low, high = f"{min(values):.2f}", f"{max(values):.2f}"
-    return low if low == high else f"{low}-{high}"
 
 
 def _yes(holds: bool) -> str:
