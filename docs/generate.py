@@ -221,6 +221,19 @@ def export_page() -> str:
                 f"{row['largest_q_difference']:.1e} | {row['equal_actions_share']:.2%} |"
             )
         lines.append("")
+        played = run / "evaluation_onnx.json"
+        if played.exists():
+            facts = json.loads(played.read_text())
+            lines += [
+                f"Played by onnxruntime, {facts['protocol']['episodes']} episodes each; "
+                f"{facts['equal_actions_share']:.2%} of its decisions are those of the trained network:",
+                "",
+                "| task | mean score | standard error |",
+                "|---|---|---|",
+            ]
+            agents = [row for row in facts["tasks"] if row["policy"] == "agent"]
+            lines += [f"| {row['task']} | {row['mean']:.2f} | {row['standard_error']:.2f} |" for row in agents]
+            lines.append("")
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items() if version)
     lines += [
         f"Machine: {environment['processor']}, {environment['cores']} cores.",

@@ -185,7 +185,7 @@ def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
 def evaluate_engine(
     engine: str, run: str | Path | None = None, task: str | None = None, checkpoint: str = "last", **protocol: Any
 ) -> tuple[Evaluation, float]:
-    """Evaluate a run's exported files instead of its network.
+    """Evaluate a run's exported files instead of its network; also written to ``export/evaluation_<engine>.json``.
 
     Args:
         engine: ``onnx`` (``export/decision.onnx``) or ``nir`` (``export/<task>.nir`` in the reference interpreter).
@@ -218,7 +218,10 @@ def evaluate_engine(
     settings = replace(config.evaluation, **protocol)
     tasks = None if task is None else (suite.names[suite.index(task)],)
     evaluation = evaluate_agent(compared, EvaluationProtocol.of(settings, config.tasks), tasks)
-    return evaluation, compared.equal / max(1, compared.decisions)
+    share = compared.equal / max(1, compared.decisions)
+    facts = {"engine": engine, "equal_actions_share": share, "decisions": compared.decisions, **evaluation.to_dict()}
+    write_atomically(folder.path / "export" / f"evaluation_{engine}.json", json.dumps(facts, indent=1).encode())
+    return evaluation, share
 
 
 def _exported(folder: RunFolder, name: str, flag: str) -> Path:

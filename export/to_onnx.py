@@ -25,7 +25,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.fold import FoldedNetwork, Layer, Neurons, metadata
 
 OPSET = 18
-"""Operator set of the files (ONNX 1.13, readable by onnxruntime 1.14 and newer)."""
+"""Operator set of the files (that of ONNX 1.13)."""
 _IR_VERSION = 8
 
 _FLOAT, _INT64 = TensorProto.FLOAT, TensorProto.INT64

@@ -258,6 +258,7 @@ def _evaluate(argv: list[str]) -> int:
     Console().print(evaluation_table(evaluation))
     if facts:
         print(f"played by {options.engine}; {share:.2%} of its decisions are those of the trained network")
+        print(path / "export" / f"evaluation_{options.engine}.json")
     else:
         print(path / "evaluations")
     return 0
