@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from threadpoolctl import threadpool_limits
 
 from switchmt_snn.learning.agent import Agent
 
@@ -42,6 +44,18 @@ def active_neurons(agent: Agent, observations: npt.NDArray[Any], task: int, seed
         layer = name if name in agent.network.trunk else "hidden"
         parts.setdefault(layer, []).append(values.flatten(2).numpy() != 0)
     return Activity(q, {name: np.concatenate(layers, axis=2) for name, layers in parts.items()})
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """PyTorch and NumPy's BLAS on one thread each, for work that is spread over threads already."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def chunks(observations: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:

@@ -93,7 +93,7 @@ def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]
             for task, observations in enumerate(observations_by_task):
                 activity: dict[str, Tensor] = {}
                 with torch.inference_mode():
-                    network.eval()(torch.from_numpy(observations), task, activity=activity)
+                    network.eval()(torch.from_numpy(observations[::4].copy()), task, activity=activity)
                 rates += [float(activity[name].mean()) for name in names]
             if min(rates) >= _MIN_RATE:
                 break

@@ -18,9 +18,8 @@ import nir
 import numpy as np
 import numpy.typing as npt
 import onnxruntime
-import torch
 
-from switchmt_snn.export.activity import active_neurons, chunks
+from switchmt_snn.export.activity import active_neurons, chunks, one_thread_each
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_out
 from switchmt_snn.export.fold import FoldedNetwork
 from switchmt_snn.export.nir_interpreter import Float, NirInterpreter
@@ -187,7 +186,7 @@ class Exports:
 def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray[Any]) -> list[Comparison]:
     """Compare every exported model of a task with the network on some observations.
 
-    Chunks are compared side by side on all cores; PyTorch runs on one thread meanwhile.
+    Chunks are compared side by side on all cores; PyTorch and NumPy run on one thread each meanwhile.
     """
     name, network = agent.suite.names[task], exports.network
     own = OnnxAgent(exports.own_decisions[name], agent.suite, agent.config) if name in exports.own_decisions else None
@@ -212,13 +211,8 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
         return results
 
     totals = [Comparison(engine, name) for engine in engines]
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            for results in pool.map(compared, *zip(*enumerate(chunks(observations)), strict=True)):
-                for total, result in zip(totals, results, strict=True):
-                    total.merge(result)
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread_each(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        for results in pool.map(compared, *zip(*enumerate(chunks(observations)), strict=True)):
+            for total, result in zip(totals, results, strict=True):
+                total.merge(result)
     return totals

@@ -14,7 +14,7 @@ from switchmt_snn.errors import ConfigError, ExportError
 from switchmt_snn.export.energy import Energy, Target, builtin_targets, estimate, load_target
 from switchmt_snn.export.profile import TaskProfile, profile_task
 from switchmt_snn.export.provenance import provenance
-from switchmt_snn.export.recording import recorded_play
+from switchmt_snn.export.recording import recorded_plays
 from switchmt_snn.learning.files import write_atomically
 from switchmt_snn.learning.run import load_agent
 from switchmt_snn.learning.run_folder import RunFolder, latest_run
@@ -92,7 +92,7 @@ def profile(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExportError(f"{folder} cannot be made ({error.strerror}), expected a folder; use --out") from error
-    recordings = [recorded_play(agent, run_folder.path / "recordings", name, decisions) for name in agent.suite.names]
+    recordings = list(recorded_plays(agent, run_folder.path / "recordings", decisions).values())
     tasks = tuple(profile_task(agent, k, recording.observations) for k, recording in enumerate(recordings))
     settings = agent.config.network
     facts = {

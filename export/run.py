@@ -17,7 +17,7 @@ from switchmt_snn.export.fold import FoldedNetwork, fold, metadata, quantized
 from switchmt_snn.export.parity import Exports
 from switchmt_snn.export.proof import prove
 from switchmt_snn.export.provenance import provenance
-from switchmt_snn.export.recording import file_name, recorded_play
+from switchmt_snn.export.recording import file_name, recorded_plays
 from switchmt_snn.export.to_nir import NirProfile, can_express, nir_graph, write_nir
 from switchmt_snn.export.to_onnx import OPSET, decision_model, step_model
 from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
@@ -112,10 +112,7 @@ def export(
         note(f"wrote {path} ({name})")
     written_at = time.perf_counter()
     note("parity: comparing the files with the trained network on recorded play")
-    recordings = {
-        task: recorded_play(agent, run_folder.path / "recordings", task, settings.parity_decisions)
-        for task in agent.suite.names
-    }
+    recordings = recorded_plays(agent, run_folder.path / "recordings", settings.parity_decisions)
     recorded_at = time.perf_counter()
     observations = {task: recording.observations for task, recording in recordings.items()}
     parity = prove(agent, _read_back(exported, files), observations)
