@@ -87,6 +87,10 @@ def export(
     settings = settings or ExportSettings()
     if settings.parity_decisions < 1:
         raise ConfigError(f"parity_decisions is {settings.parity_decisions}, expected at least 1")
+    if settings.tasks and settings.nir and not settings.onnx:
+        raise ConfigError(
+            "--task names a decision_TASK.onnx, expected --onnx with it (--nir writes every task); add --onnx"
+        )
     run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)

@@ -120,6 +120,7 @@ def test_wrong_use_is_one_line(run: Path, tmp_path: Path, capsys: pytest.Capture
         ((tmp_path / "nowhere",), "no run folder"),
         ((run, "--task", "pong"), "unknown task 'pong'"),
         ((run, "--nir-profile", "exakt"), "exakt"),
+        ((run, "--nir", "--task", "asterix"), "expected --onnx with it"),
         ((run, "--parity-decisions", "0"), "parity_decisions is 0, expected at least 1"),
         ((run, "--out", run / "config.yaml"), "config.yaml"),
         ((run, "--checkpoint", "best"), "no whole best checkpoint"),

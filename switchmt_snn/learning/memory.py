@@ -49,7 +49,8 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
     parameters = trainable_parameters(network) * 4
     snapshots = config.switching.window_episodes + 2 if config.switching.policy.startswith("parameter") else 0
     # A training step keeps currents, membranes, spikes and the surrogate's terms of T steps, the inputs as floats
-    # besides. Measured as peak memory at batch 64 and 256 on the 84x84 network: 7.1 floats per neuron and step.
+    # besides. Peak memory at batch 64 and 256 on the 84x84 network, before the
+    # surrogate's backward worked in place (which takes less): 7.1 floats per neuron and step.
     batch = config.learning.batch_size
     steps = config.network.timesteps
     activations = batch * 4 * (8 * neurons * steps + 4 * math.prod(suite.observation_shape))
