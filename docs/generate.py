@@ -118,8 +118,9 @@ def what_it_took(folder: Path, games: tuple[str, ...]) -> list[str]:
         *lines,
         "",
         f"At random play Asterix gives a reward every {asterix:.0f} steps, Space Invaders every {invaders:.0f}.",
-        "A likely explanation, not measured: one task's gradients are far larger than the other's, and Adam divides both by the",
-        "larger; scaling every gradient to one norm gives the tasks equal steps. Space Invaders scores lower with it.",
+        "A likely explanation, not measured: one task's gradients are far larger than the other's, and Adam divides",
+        "both by the larger; scaling every gradient to one norm gives the tasks equal steps. Space Invaders scores",
+        "lower with it.",
         "Not told apart: the higher learning rate and the clipping (one pilot run with 3e-4 and no clipping, stopped",
         "half-way and not kept, had Asterix at random).",
     ]
