@@ -216,8 +216,8 @@ def export_page() -> str:
             f"Exact numbers: {bitwise} of {len(exact)} comparisons bitwise equal, {sum(r['decisions'] for r in exact)} "
             "decisions."
             + (f" Simulators ({names}): {agree} of {len(simulators)} bitwise equal." if simulators else ""),
-            f"Files written in {parity['wall_s']['write']:.1f} s, compared in {parity['wall_s']['parity']:.1f} s "
-            f"(play recorded before in {parity['wall_s']['record']:.1f} s).",
+            f"Files written in {parity['wall_s']['write']:.1f} s, play recorded and compared in "
+            f"{parity['wall_s']['record_and_compare']:.1f} s.",
             "",
             "| task | engine | decisions | flips | spikes | largest Q difference | same action |",
             "|---|---|---|---|---|---|---|",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from switchmt_snn.learning.agent import Agent
 
-CHUNK = 64
+CHUNK = 32
 """Decisions that are held in memory at once."""
 
 
@@ -47,13 +49,13 @@ def active_neurons(agent: Agent, observations: npt.NDArray[Any], task: int, seed
 
 
 @contextmanager
-def one_thread_each() -> Iterator[None]:
-    """PyTorch and NumPy's BLAS on one thread each, for work that is spread over threads already."""
+def all_cores() -> Iterator[ThreadPoolExecutor]:
+    """A thread for every core; PyTorch and NumPy's BLAS on one thread each meanwhile."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
+        with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            yield pool
     finally:
         torch.set_num_threads(threads)
 

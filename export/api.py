@@ -97,7 +97,10 @@ def check_parity(
         observations = {
             name: play(agent, name, 1000, evaluation.epsilon, evaluation.seed).observations for name in names
         }
-    return prove(agent, written, observations)
+    missing = [name for name in names if name not in observations]
+    if missing:
+        raise ExportError(f"observations of {', '.join(missing)} are missing, expected every task: {', '.join(names)}")
+    return prove(agent, written, [observations[name] for name in names])
 
 
 def _folded(source: Source, int8: bool) -> FoldedNetwork:

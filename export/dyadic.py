@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from switchmt_snn.export.activity import all_cores, chunks
 from switchmt_snn.export.engines import encode
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.spiking.dendrites import ActiveDendrites
@@ -45,7 +46,14 @@ def exact_copy(agent: Agent, observations_by_task: list[npt.NDArray[Any]]) -> tu
     for bits in _WEIGHT_BITS:
         twin = dyadic_copy(agent, bits)
         wake_silent_layers(twin, observations_by_task)
-        if all(is_exact(twin, task, x) for task, x in enumerate(observations_by_task)):
+        with all_cores() as pool:
+            jobs = [
+                pool.submit(is_exact, twin, task, chunk, seed)
+                for task, observations in enumerate(observations_by_task)
+                for seed, chunk in enumerate(chunks(observations))
+            ]
+            exact = all(job.result() for job in jobs)
+        if exact:
             return twin, True
     return twin, False
 
@@ -102,22 +110,24 @@ def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]
                     cast(Any, layers[name]).neurons.leaky.threshold.div_(2.0)
 
 
-def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any]) -> bool:
+def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any], seed: int = 0) -> bool:
     """Whether the network computes the same in float32 and in float64: then nothing was rounded.
 
-    Rounding of Q by a mean over T that is no power of two is left out; the spikes decide.
+    ``seed`` is of a random encoding. Rounding of Q by a mean over T that is no power of two is left out; the spikes
+    decide.
     """
-    wide = copy.deepcopy(agent.network).double()
+    # snnTorch's neurons write into themselves; copies keep calls from several threads apart.
+    same_bits, wide = copy.deepcopy(agent.network), copy.deepcopy(agent.network).double()
     for module in wide.modules():
         if isinstance(module, SpikingLayer):
             module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
-    scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, 0).copy())
+    scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, seed).copy())
     narrow_activity: dict[str, torch.Tensor] = {}
     wide_activity: dict[str, torch.Tensor] = {}
     narrow, wide_q = (
         _from_encoded(network, scaled.to(dtype), task, activity)
         for network, dtype, activity in (
-            (agent.network, torch.float32, narrow_activity),
+            (same_bits, torch.float32, narrow_activity),
             (wide, torch.float64, wide_activity),
         )
     )

@@ -9,8 +9,6 @@ Shapes: T simulation steps, B batch (decisions), L neuron layers, A actions.
 from __future__ import annotations
 
 import copy
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -19,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime
 
-from switchmt_snn.export.activity import active_neurons, chunks, one_thread_each
+from switchmt_snn.export.activity import active_neurons, all_cores, chunks
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_out
 from switchmt_snn.export.fold import FoldedNetwork
 from switchmt_snn.export.nir_interpreter import Float, NirInterpreter
@@ -211,7 +209,7 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
         return results
 
     totals = [Comparison(engine, name) for engine in engines]
-    with one_thread_each(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    with all_cores() as pool:
         for results in pool.map(compared, *zip(*enumerate(chunks(observations)), strict=True)):
             for total, result in zip(totals, results, strict=True):
                 total.merge(result)

@@ -92,7 +92,7 @@ def profile(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExportError(f"{folder} cannot be made ({error.strerror}), expected a folder; use --out") from error
-    recordings = list(recorded_plays(agent, run_folder.path / "recordings", decisions).values())
+    recordings = list(recorded_plays(agent, run_folder.path / "recordings", decisions))
     tasks = tuple(profile_task(agent, k, recording.observations) for k, recording in enumerate(recordings))
     settings = agent.config.network
     facts = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -9,47 +11,59 @@ import nir
 import numpy as np
 import numpy.typing as npt
 
+from switchmt_snn.export.activity import all_cores
 from switchmt_snn.export.dyadic import dyadic_observations, exact_copy
 from switchmt_snn.export.engines import OnnxAgent, encode
 from switchmt_snn.export.fold import FoldedNetwork, fold
 from switchmt_snn.export.nir_interpreter import NirInterpreter
 from switchmt_snn.export.parity import MIN_EQUAL_ACTIONS, Comparison, Exports, compare
-from switchmt_snn.export.simulators import SIMULATORS, simulate
+from switchmt_snn.export.simulators import SIMULATORS, quietly, simulate
 from switchmt_snn.export.to_nir import NirProfile, nir_graph
 from switchmt_snn.export.to_onnx import decision_model, step_model
 from switchmt_snn.learning.agent import Agent
 
-DYADIC_DECISIONS = 64
-SIMULATOR_DECISIONS = 32
+DYADIC_DECISIONS = 32
+SIMULATOR_DECISIONS = 16
 
 Observations = npt.NDArray[Any]
 
 
-def prove(agent: Agent, written: Exports, observations: dict[str, Observations]) -> dict[str, Any]:
+def prove(agent: Agent, written: Exports, observations: Iterable[Observations]) -> dict[str, Any]:
     """Compare exported models with the network that they came from.
 
     Args:
         agent: the trained network.
         written: the models, as read back.
-        observations: raw observations ``[N, *shape]`` of each task.
+        observations: raw observations ``[N, *shape]`` of each task in turn; taken one by one, so that they may still
+            be coming.
 
     Returns:
         The content of ``parity.json``; ``failures`` is empty if everything agrees as it must.
     """
-    return _Proof(agent, written, observations).check()
+    return _Proof(agent, written).check(observations)
 
 
 class _Proof:
-    def __init__(self, agent: Agent, written: Exports, observations: dict[str, Observations]) -> None:
-        self.agent, self.written, self.observations = agent, written, observations
+    def __init__(self, agent: Agent, written: Exports) -> None:
+        self.agent, self.written = agent, written
         self.int8 = written.network.head.weight_steps_O is not None
         self.failures: list[str] = []
 
-    def check(self) -> dict[str, Any]:
+    def check(self, observations: Iterable[Observations]) -> dict[str, Any]:
         """All comparisons as plain values."""
-        dyadic, real, simulators, stored = [], [], [], []
+        dyadic, real, stored, exact_inputs = [], [], [], []
         names = self.agent.suite.names
-        exact_inputs = [dyadic_observations(_spread(self.observations[name], DYADIC_DECISIONS)) for name in names]
+        for task, recorded in enumerate(observations):
+            exact_inputs.append(dyadic_observations(_spread(recorded, DYADIC_DECISIONS)))
+            for comparison in compare(self.agent, self.written, task, recorded):
+                real.append(comparison.to_dict())
+                if not self.int8 and comparison.equal_actions_share < MIN_EQUAL_ACTIONS:
+                    self.failures.append(
+                        f"{names[task]}, {comparison.engine}: {comparison.equal_actions_share:.1%} equal actions, "
+                        f"first difference in layer {comparison.first_difference}"
+                    )
+            if self.int8 and self.written.decision is not None:
+                stored.append(self._stored_integers(self.written.decision, task, recorded))
         twin, exact = exact_copy(self.agent, exact_inputs)
         if not exact:
             self.failures.append("every dyadic copy rounds, so the bitwise check proves nothing (please report this)")
@@ -62,17 +76,7 @@ class _Proof:
                         f"{name}, {comparison.engine}: not bitwise equal on exact numbers, first in layer "
                         f"{comparison.first_difference}"
                     )
-            for comparison in compare(self.agent, self.written, task, self.observations[name]):
-                real.append(comparison.to_dict())
-                if not self.int8 and comparison.equal_actions_share < MIN_EQUAL_ACTIONS:
-                    self.failures.append(
-                        f"{name}, {comparison.engine}: {comparison.equal_actions_share:.1%} equal actions, first "
-                        f"difference in layer {comparison.first_difference}"
-                    )
-            if self.int8 and self.written.decision is not None:
-                stored.append(self._stored_integers(self.written.decision, name))
-            if copied.graphs is not None:
-                simulators += self._simulators(twin, copied.graphs[name], exact_inputs[task], name)
+        simulators = self._simulators(twin, copied.graphs, exact_inputs) if copied.graphs is not None else []
         return {
             "dyadic": dyadic,
             "recorded": real,
@@ -104,50 +108,58 @@ class _Proof:
             {name: decision_model(network, names.index(name)).SerializeToString() for name in written.own_decisions},
         )
 
-    def _stored_integers(self, decision: bytes, task: str) -> dict[str, Any]:
+    def _stored_integers(self, decision: bytes, task: int, recorded: Observations) -> dict[str, Any]:
         """The int8 file against a float32 graph with the same rounded weights: only the storage may differ."""
         network = self.written.network
         floats = replace(network, layers=tuple(replace(layer, weight_steps_O=None) for layer in network.layers))
         stored, plain = (
-            OnnxAgent(model, self.agent.suite, self.agent.config).q_values(
-                self.observations[task], self.agent.suite.index(task)
-            )
+            OnnxAgent(model, self.agent.suite, self.agent.config).q_values(recorded, task)
             for model in (decision, decision_model(floats).SerializeToString())
         )
+        name = self.agent.suite.names[task]
         equal = float((stored.argmax(axis=1) == plain.argmax(axis=1)).mean())
         if equal < MIN_EQUAL_ACTIONS:
-            self.failures.append(f"{task}: the int8 file does not decide as its own integers do ({equal:.1%})")
-        return {"task": task, "decisions": len(stored), "equal_actions_share": equal}
+            self.failures.append(f"{name}: the int8 file does not decide as its own integers do ({equal:.1%})")
+        return {"task": name, "decisions": len(stored), "equal_actions_share": equal}
 
     def _simulators(
-        self, twin: Agent, graph: nir.NIRGraph, observations: Observations, task: str
+        self, twin: Agent, graphs: dict[str, nir.NIRGraph], exact_inputs: list[Observations]
     ) -> list[dict[str, Any]]:
-        """Every installed simulator on the dyadic graph, against the interpreter under the same convention."""
-        if str(graph.metadata["profile"]) in ("exact", "legacy") or twin.config.network.neuron != "IF":
+        """Every installed simulator on the dyadic graphs, against the interpreter under the same convention."""
+        metadata = next(iter(graphs.values())).metadata
+        if str(metadata["profile"]) in ("exact", "legacy") or twin.config.network.neuron != "IF":
             return []  # loops, and files for older readers, are not what these importers take
-        inputs_TB = encode(twin.suite, twin.config, _spread(observations, SIMULATOR_DECISIONS), 0)
-        rows = []
-        for name, simulator in SIMULATORS.items():
-            if not simulator.installed or (name in ("norse", "nirtorch") and float(graph.metadata["dt"]) != 1.0):
-                continue
-            expected, _ = NirInterpreter(graph, **simulator.interpreter).run(inputs_TB)
+        names = [
+            name
+            for name, simulator in SIMULATORS.items()
+            if simulator.installed and (name not in ("norse", "nirtorch") or float(metadata["dt"]) == 1.0)
+        ]
+
+        def simulated(task: str, name: str) -> dict[str, Any]:
+            simulator, recorded = SIMULATORS[name], exact_inputs[twin.suite.index(task)]
+            inputs_TB = encode(twin.suite, twin.config, _spread(recorded, SIMULATOR_DECISIONS), 0)
+            expected, _ = NirInterpreter(graphs[task], **simulator.interpreter).run(inputs_TB)
             refused, equal = None, False
             try:
-                equal = bool(np.array_equal(expected, simulate(name, graph, inputs_TB)))
+                equal = bool(np.array_equal(expected, simulate(name, graphs[task], inputs_TB)))
             except (ValueError, NotImplementedError) as error:  # it says itself that it cannot read such a network
                 refused = str(error)
-            rows.append(
-                {
-                    "simulator": name,
-                    "task": task,
-                    "convention": simulator.convention,
-                    "decisions": inputs_TB.shape[1],
-                    "bitwise": equal,
-                    "refused": refused,
-                }
-            )
-            if not equal and refused is None:
-                self.failures.append(f"{task}, {name}: not bitwise equal under its convention ({simulator.convention})")
+            return {
+                "simulator": name,
+                "task": task,
+                "convention": simulator.convention,
+                "decisions": inputs_TB.shape[1],
+                "bitwise": equal,
+                "refused": refused,
+            }
+
+        with quietly(), all_cores() as pool:
+            rows = list(pool.map(simulated, *zip(*itertools.product(graphs, names), strict=True))) if names else []
+        self.failures += [
+            f"{row['task']}, {row['simulator']}: not bitwise equal under its convention ({row['convention']})"
+            for row in rows
+            if not row["bitwise"] and row["refused"] is None
+        ]
         return rows
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 import re
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.activity import one_thread_each
+from switchmt_snn.export.activity import all_cores
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.tasks.play import Play, episode_seed
 
@@ -45,8 +44,8 @@ def file_name(task: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "_", task)
 
 
-def recorded_plays(agent: Agent, folder: Path, decisions: int) -> dict[str, Recording]:
-    """:func:`recorded_play` of every task, the tasks side by side, each with a copy of the agent."""
+def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recording]:
+    """:func:`recorded_play` of every task in turn; while one is used, the next are being played."""
 
     def one(task: str) -> Recording:
         network = copy.deepcopy(agent.network)
@@ -54,8 +53,8 @@ def recorded_plays(agent: Agent, folder: Path, decisions: int) -> dict[str, Reco
             Agent(network, agent.suite, agent.config, agent.device, agent.step), folder, task, decisions
         )
 
-    with one_thread_each(), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        return dict(zip(agent.suite.names, pool.map(one, agent.suite.names), strict=True))
+    with all_cores() as pool:
+        yield from pool.map(one, agent.suite.names)
 
 
 def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Recording:

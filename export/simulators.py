@@ -9,7 +9,8 @@ from __future__ import annotations
 import importlib.util
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -114,10 +115,16 @@ SIMULATORS: dict[str, Simulator] = {
 
 def simulate(name: str, graph: nir.NIRGraph, inputs_TB: Float) -> Float:
     """Outputs ``[T, B, ...]`` of a graph in a simulator, on encoded inputs ``[T, B, ...]``."""
+    return SIMULATORS[name].run(graph, np.ascontiguousarray(inputs_TB), float(graph.metadata["dt"]))
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Without the simulators' warnings (outside of threads: warning filters belong to the process)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logging.getLogger("torch").setLevel(logging.ERROR)
-        return SIMULATORS[name].run(graph, np.ascontiguousarray(inputs_TB), float(graph.metadata["dt"]))
+        yield
 
 
 def _one_by_one(step: Callable[[torch.Tensor, Any], tuple[torch.Tensor, Any]], inputs_TB: Float) -> Float:

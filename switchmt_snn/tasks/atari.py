@@ -42,14 +42,17 @@ class AtariCopies:
 
     def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
         """Start episodes: no-ops (number drawn from the seed) and FIRE happen inside."""
-        if not self._started:
-            # The first reset of a vector environment must be whole; copies not asked for get a seed of no consequence.
-            self._env.reset(seed=np.zeros(self.num_envs, np.int64))
-            self._started = True
-        mask = np.zeros(self.num_envs, np.bool_)
-        mask[env_ids] = True
         order = np.argsort(env_ids)
-        observations, _ = self._env.reset(seed=seeds[order], options={"reset_mask": mask})
+        if len(env_ids) == self.num_envs:
+            observations, _ = self._env.reset(seed=seeds[order])
+        else:
+            if not self._started:
+                # The first reset of a vector environment must be whole; the others get a seed of no consequence.
+                self._env.reset(seed=np.zeros(self.num_envs, np.int64))
+            mask = np.zeros(self.num_envs, np.bool_)
+            mask[env_ids] = True
+            observations, _ = self._env.reset(seed=seeds[order], options={"reset_mask": mask})
+        self._started = True
         return np.asarray(observations[env_ids], np.uint8)
 
     def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
