@@ -1,11 +1,12 @@
 """Export of trained networks (imported as ``switchmt_snn.export``).
 
 ``fold`` makes one chain of layers of a network, ``to_onnx`` and ``to_nir`` write it, ``parity`` compares what was
-written with the trained network, and ``run`` does all of it for a run folder.
+written with the trained network, and ``run`` does all of it for a run folder. ``profiling`` counts what a network does
+while it plays, prices it, and writes a report.
 """
 
 from switchmt_snn.export.api import check_parity, to_nir, to_onnx
-from switchmt_snn.export.profiling import Profile, profile
+from switchmt_snn.export.profiling import Profile, compare_profiles, profile, profile_file
 from switchmt_snn.export.run import ExportResult, ExportSettings, evaluate_engine, export
 
 __all__ = [
@@ -13,9 +14,11 @@ __all__ = [
     "ExportSettings",
     "Profile",
     "check_parity",
+    "compare_profiles",
     "evaluate_engine",
     "export",
     "profile",
+    "profile_file",
     "to_nir",
     "to_onnx",
 ]

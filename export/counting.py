@@ -19,6 +19,9 @@ import numpy.typing as npt
 
 Int = npt.NDArray[np.int64]
 
+RATE_BINS = 20
+"""Ranges of firing rates that a distribution is told in."""
+
 
 @dataclass(frozen=True)
 class Synapses:
@@ -119,6 +122,12 @@ class NeuronCounter:
         """Spikes per neuron and simulation step."""
         rates: npt.NDArray[np.float64] = self.spikes_TN.sum(axis=0) / max(1, self.decisions * len(self.spikes_TN))
         return rates
+
+    @property
+    def rate_histogram(self) -> tuple[int, ...]:
+        """Number of neurons that fire in each of :data:`RATE_BINS` equal ranges of spikes per step."""
+        rate_N = self.rate_N
+        return tuple(np.histogram(rate_N[rate_N > 0], RATE_BINS, (0.0, 1.0))[0].tolist())
 
     @property
     def silent(self) -> int:

@@ -7,7 +7,7 @@ is reported as not included.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import yaml
 
 from switchmt_snn.errors import ConfigError, did_you_mean
 from switchmt_snn.export.profile import LayerProfile, TaskProfile
+from switchmt_snn.export.traffic import Traffic, ann_traffic, traffic
 
 UNITS_PJ = {"fJ": 1e-3, "pJ": 1.0, "nJ": 1e3}
 EVIDENCE = ("measured", "simulated", "estimated", "reported")
@@ -72,12 +73,26 @@ class Target:
 
 
 @dataclass(frozen=True)
+class LayerEnergy:
+    """Energy of one layer per decision; ``memory_pj`` by what is accessed, empty without a memory model."""
+
+    layer: str
+    compute_pj: float
+    memory_pj: dict[str, float]
+
+    @property
+    def total_pj(self) -> float:
+        """Compute and memory."""
+        return self.compute_pj + sum(self.memory_pj.values())
+
+
+@dataclass(frozen=True)
 class Energy:
     """Energy of one decision in one task on one target, mean over the recorded decisions.
 
     Attributes:
-        compute_pj: operations, neuron updates and spikes that have a price.
-        memory_pj: weight and membrane traffic; None where the target has no memory model.
+        layers: in forward order: operations, neuron updates and spikes that have a price, and memory traffic where the
+            target has a memory model.
         not_included: what was counted and has no price, in words.
         ann_compute_pj: of the ANN twin; None where the target cannot multiply.
         quantised_ann_compute_pj: of the quantised twin, bit-serial: one addition per activation bit and weight, if that
@@ -86,12 +101,21 @@ class Energy:
 
     target: str
     task: str
-    compute_pj: float
-    memory_pj: float | None
+    layers: tuple[LayerEnergy, ...]
     not_included: tuple[str, ...]
     ann_compute_pj: float | None
     ann_memory_pj: float | None
     quantised_ann_compute_pj: float | None
+
+    @property
+    def compute_pj(self) -> float:
+        """Operations, neuron updates and spikes."""
+        return sum(layer.compute_pj for layer in self.layers)
+
+    @property
+    def memory_pj(self) -> float | None:
+        """Weight, state and activation traffic; None where the target has no memory model."""
+        return None if self.ann_memory_pj is None else sum(sum(layer.memory_pj.values()) for layer in self.layers)
 
     @property
     def total_pj(self) -> float:
@@ -115,75 +139,69 @@ class Energy:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, with the power at :data:`DECISIONS_PER_S`."""
         return {
-            **{name: list(v) if isinstance(v, tuple) else v for name, v in vars(self).items()},
+            "target": self.target,
+            "task": self.task,
+            "compute_pj": self.compute_pj,
+            "memory_pj": self.memory_pj,
             "total_pj": self.total_pj,
+            "not_included": list(self.not_included),
+            "ann_compute_pj": self.ann_compute_pj,
+            "ann_memory_pj": self.ann_memory_pj,
+            "quantised_ann_compute_pj": self.quantised_ann_compute_pj,
             "by_ann": self.by_ann,
             "by_quantised_ann": self.by_quantised_ann,
             "power_uw": self.total_pj * 1e-12 * DECISIONS_PER_S * 1e6,
+            "layers": [asdict(layer) | {"total_pj": layer.total_pj} for layer in self.layers],
         }
 
 
 def estimate(task: TaskProfile, target: Target) -> Energy:
     """Energy of a task's mean decision."""
-    prices, unpriced, compute = target.operations_pj, [], 0.0
-
-    def charge(count: float, price: float | None, what: str) -> None:
-        nonlocal compute
-        if count > 0 and price is None:
-            unpriced.append(f"{count:,.0f} {what}")
-        elif price is not None:
-            compute += count * price
-
-    for layer in task.layers:
-        price = prices.get("mac") if layer.operation == "MAC" else _ac_price(prices, layer)
-        kind = "multiplications" if layer.operation == "MAC" else "accumulations"
-        charge(layer.effective_per_decision, price, f"{kind} of {layer.name}")
-    if task.spiking:
-        charge(
-            sum(layer.neuron_updates_per_decision for layer in task.layers),
-            prices.get("neuron_update"),
-            "neuron updates",
-        )
-        # A spike has a price of its own on some chips; on the others it is part of what it causes.
-        compute += task.spikes * prices.get("spike", 0.0)
-    macs, mac = task.dense_macs_of_ann_twin, prices.get("mac")
+    unpriced: list[str] = []
+    layers = tuple(_layer_energy(layer, task.spiking, target, unpriced) for layer in task.layers)
+    macs, mac = task.dense_macs_of_ann_twin, target.operations_pj.get("mac")
     bits = math.ceil(math.log2(task.timesteps + 1))
+    ann_memory = None
+    if target.memory is not None:
+        ann_memory = sum(sum(_memory_pj(ann_traffic(layer), layer, target.memory).values()) for layer in task.layers)
     return Energy(
         target=target.name,
         task=task.task,
-        compute_pj=compute,
-        memory_pj=None if target.memory is None else _memory_pj(task, target.memory),
+        layers=layers,
         not_included=tuple(unpriced),
         ann_compute_pj=None if mac is None else macs * mac,
-        ann_memory_pj=None if target.memory is None else _ann_memory_pj(task, target.memory),
-        quantised_ann_compute_pj=None if mac is None else macs * min(mac, bits * prices["ac"]),
+        ann_memory_pj=ann_memory,
+        quantised_ann_compute_pj=None if mac is None else macs * min(mac, bits * target.operations_pj["ac"]),
     )
 
 
-def _ac_price(prices: dict[str, float], layer: LayerProfile) -> float | None:
-    return prices.get("ac_conv", prices.get("ac")) if layer.convolution else prices.get("ac")
+def _layer_energy(layer: LayerProfile, spiking: bool, target: Target, unpriced: list[str]) -> LayerEnergy:
+    prices = target.operations_pj
+    if layer.operation == "MAC":
+        charges = [(layer.effective_per_decision, prices.get("mac"), "multiplications")]
+    else:
+        price = prices.get("ac_conv", prices["ac"]) if layer.convolution else prices["ac"]
+        charges = [(layer.effective_per_decision, price, "accumulations")]
+    if spiking:
+        charges.append((layer.neuron_updates_per_decision, prices.get("neuron_update"), "neuron updates"))
+        # A spike has a price of its own on some chips; on the others it is part of what it causes.
+        charges.append((layer.spikes_per_decision, prices.get("spike", 0.0), "spikes"))
+    unpriced += [f"{count:,.0f} {what} of {layer.name}" for count, price, what in charges if count and price is None]
+    compute = sum(count * price for count, price, _ in charges if price is not None)
+    memory = {} if target.memory is None else _memory_pj(traffic(layer, spiking), layer, target.memory)
+    return LayerEnergy(layer.name, compute, memory)
 
 
-def _memory_pj(task: TaskProfile, memory: Memory) -> float:
-    """Every effective operation reads its weight; every neuron update reads and writes its membrane."""
-    total = 0.0
-    for layer in task.layers:
-        total += layer.effective_per_decision * memory.access_pj(layer.weights, memory.weight_bits)
-        if layer.neuron_updates_per_decision:
-            state_pj = memory.access_pj(layer.neurons, memory.state_bits)
-            total += 2 * layer.neuron_updates_per_decision * state_pj
-    return total
-
-
-def _ann_memory_pj(task: TaskProfile, memory: Memory) -> float:
-    """Every multiplication reads its weight (no reuse, as for the spiking network); activations are written once."""
-    total = 0.0
-    for layer in task.layers:
-        macs = layer.dense_per_decision // max(1, len(layer.effective_T))
-        total += macs * memory.access_pj(layer.weights, memory.weight_bits)
-        if layer.neurons:
-            total += layer.neurons * memory.access_pj(layer.neurons, memory.state_bits)
-    return total
+def _memory_pj(accesses: Traffic, layer: LayerProfile, memory: Memory) -> dict[str, float]:
+    """Energy of memory accesses: each from the smallest memory that holds what lies there."""
+    smallest = memory.access_pj(1, memory.state_bits)
+    return {
+        "events": accesses.events * smallest,
+        "activations": accesses.activations * memory.access_pj(max(layer.inputs, layer.outputs), memory.state_bits),
+        "weights": accesses.weights * memory.access_pj(layer.weights, memory.weight_bits),
+        "biases": accesses.biases * memory.access_pj(layer.outputs, memory.weight_bits),
+        "state": accesses.state * memory.access_pj(layer.outputs, memory.state_bits),
+    }
 
 
 def builtin_targets() -> dict[str, Target]:

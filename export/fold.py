@@ -27,6 +27,9 @@ from switchmt_snn.tasks.suite import TaskSuite
 
 Array = npt.NDArray[np.float64]
 
+SPIKE_ENCODINGS = ("rate", "latency", "events")
+"""Encodings whose values are spikes."""
+
 
 @dataclass(frozen=True)
 class Neurons:
@@ -130,6 +133,11 @@ class FoldedNetwork:
     def spiking(self) -> bool:
         """Whether the neurons spike."""
         return any(layer.neurons is not None and layer.neurons.kind != "relu" for layer in self.layers)
+
+    @property
+    def sees_spikes(self) -> bool:
+        """Whether the first layer's inputs are spikes."""
+        return self.config.network.encoding in SPIKE_ENCODINGS
 
     @property
     def encoded_shape(self) -> tuple[int, ...]:
@@ -269,6 +277,7 @@ def metadata(network: FoldedNetwork) -> dict[str, Any]:
         "method": settings.method,
         "timesteps": settings.timesteps,
         "encoding": settings.encoding,
+        "event_threshold": settings.event_threshold,
         "readout": settings.readout,
         "readout_beta": settings.readout_beta,
         "reset": settings.reset if network.spiking else "none",

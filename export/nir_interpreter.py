@@ -19,6 +19,8 @@ from switchmt_snn.errors import ExportError
 
 Float = npt.NDArray[np.float32]
 Step = Callable[[Float], Float]
+Pair = tuple[int, int]
+"""Vertical and horizontal."""
 
 
 class NirInterpreter:
@@ -31,6 +33,11 @@ class NirInterpreter:
             ``subtract`` (the threshold, as sinabs does).
         fires_at_threshold: whether v == threshold fires (``>=``); NIR defines ``>``.
         floor: whether membranes stay at or above minus the threshold (sinabs); NIR has no floor.
+
+    Attributes:
+        order: names of the nodes in forward order.
+        sources: names of the nodes whose outputs each node receives; their sum is its input.
+        geometry: stride and zero padding of each Conv2d node.
 
     Raises:
         ExportError: the graph has nodes or a structure that is not known here.
@@ -50,12 +57,24 @@ class NirInterpreter:
             dt = float(graph.metadata["dt"])
         self.graph, self.dt, self.reset, self.floor = graph, dt, reset, floor
         self._fires = np.greater_equal if fires_at_threshold else np.greater
-        self.order, self.feedback = _topological_order(graph)
-        (self.input,) = [name for name, node in graph.nodes.items() if isinstance(node, nir.Input)]
-        (self.output,) = [name for name, node in graph.nodes.items() if isinstance(node, nir.Output)]
         unknown = {type(node).__name__ for node in graph.nodes.values()} - {*_KNOWN, "Input", "Output"}
         if unknown:
             raise ExportError(f"the NIR graph has {', '.join(sorted(unknown))}, expected only {', '.join(_KNOWN)}")
+        for name, node in graph.nodes.items():
+            _check_shape(name, node)
+        self.input, self.output = _only(graph, nir.Input), _only(graph, nir.Output)
+        self.order, self.feedback = _topological_order(graph)
+        apart = sorted(graph.nodes.keys() - set(self.order))
+        if apart:
+            raise ExportError(
+                f"no path leads from the NIR graph's Input to {', '.join(apart)}, expected one to each node"
+            )
+        self.sources: dict[str, list[str]] = {name: [] for name in graph.nodes}
+        for source, target in graph.edges:
+            self.sources[target].append(source)
+        self.geometry = {
+            name: _geometry(name, node) for name, node in graph.nodes.items() if isinstance(node, nir.Conv2d)
+        }
 
     def run(self, inputs_TB: Float, record: list[str] | None = None) -> tuple[Float, dict[str, Float]]:
         """Simulate T steps from rest.
@@ -68,11 +87,8 @@ class NirInterpreter:
             The output node's values ``[T, B, ...]``, and the recorded ones by name.
         """
         steps: dict[str, Step] = {
-            name: self._stepper(node) for name, node in self.graph.nodes.items() if type(node).__name__ in _KNOWN
+            name: self._stepper(name, node) for name, node in self.graph.nodes.items() if type(node).__name__ in _KNOWN
         }
-        sources: dict[str, list[str]] = {name: [] for name in self.graph.nodes}
-        for source, target in self.graph.edges:
-            sources[target].append(source)
         kept: dict[str, list[Float]] = {name: [] for name in {*(record or []), self.output}}
         before: dict[str, Float] = {}
         same_input = inputs_TB.strides[0] == 0  # direct encoding: one array, seen T times
@@ -84,7 +100,8 @@ class NirInterpreter:
                 if name == self.input:
                     continue
                 arriving = [
-                    before.get(source) if (source, name) in self.feedback else now[source] for source in sources[name]
+                    before.get(source) if (source, name) in self.feedback else now[source]
+                    for source in self.sources[name]
                 ]
                 present = [value for value in arriving if value is not None]
                 total = present[0] if len(present) == 1 else cast(Float, sum(present))
@@ -95,10 +112,10 @@ class NirInterpreter:
         recorded = {name: np.stack(values) for name, values in kept.items()}
         return recorded[self.output], recorded
 
-    def _stepper(self, node: nir.NIRNode) -> Step:
+    def _stepper(self, name: str, node: nir.NIRNode) -> Step:
         """A fresh node at rest: input of one step ``[B, ...]`` -> output of that step."""
         if isinstance(node, nir.Conv2d):
-            return _once(lambda x: _convolve(x, node))
+            return _once(lambda x: _convolve(x, node, *self.geometry[name]))
         if isinstance(node, nir.Affine):
             return _once(lambda x: cast(Float, x @ node.weight.T + node.bias))
         if isinstance(node, nir.Linear):
@@ -153,15 +170,79 @@ class _Membrane:
         return cast(Float, fired.astype(np.float32))
 
 
-def _convolve(x: Float, node: nir.Conv2d) -> Float:
-    """Cross-correlation without padding, dilation or groups: all windows times all kernels."""
-    (out, _, kh, kw), stride = node.weight.shape, int(np.ravel(node.stride)[0])
-    windows = np.lib.stride_tricks.sliding_window_view(x, (kh, kw), axis=(2, 3))[:, :, ::stride, ::stride]
+def _convolve(x: Float, node: nir.Conv2d, stride: Pair, padding: Pair) -> Float:
+    """Cross-correlation without dilation or groups: all windows times all kernels."""
+    (out, _, kh, kw), (sy, sx) = node.weight.shape, stride
+    windows = np.lib.stride_tricks.sliding_window_view(_padded(x, padding), (kh, kw), axis=(2, 3))[:, :, ::sy, ::sx]
     batch, _, height, width = windows.shape[:4]
     # Channels innermost: the windows' rows are then contiguous in the output of a layer before, and quick to gather.
     columns = windows.transpose(0, 2, 3, 4, 5, 1).reshape(batch * height * width, -1)
     y = columns @ node.weight.transpose(0, 2, 3, 1).reshape(out, -1).T + node.bias
     return cast(Float, y.reshape(batch, height, width, out).transpose(0, 3, 1, 2))
+
+
+def _padded(x: Float, padding: Pair) -> Float:
+    """Zeros around images ``[B, C, H, W]``; channels stay innermost in memory."""
+    if padding == (0, 0):
+        return x
+    (batch, channels, height, width), (py, px) = x.shape, padding
+    around = np.zeros((batch, height + 2 * py, width + 2 * px, channels), np.float32).transpose(0, 3, 1, 2)
+    around[:, :, py : py + height, px : px + width] = x
+    return around
+
+
+def _check_shape(name: str, node: nir.NIRNode) -> None:
+    """Refuse what NIR allows in shapes and the interpreter would get wrong."""
+    if isinstance(node, (nir.Affine, nir.Linear)) and node.weight.ndim != 2:
+        raise ExportError(f"the NIR node {name} has weights of shape {node.weight.shape}, expected (outputs, inputs)")
+    if isinstance(node, nir.Flatten):
+        flat = node.output_type["output"]
+        if flat is not None and len(flat) != 1:
+            raise ExportError(f"the NIR node {name} flattens to {_plain(flat)}, expected one dimension")
+
+
+def _geometry(name: str, node: nir.Conv2d) -> tuple[Pair, Pair]:
+    """Stride and padding of a convolution. NIR files hold them as a number, a pair or an array; padding also by name.
+
+    Raises:
+        ExportError: dilation, groups, or a padding that :func:`_convolve` does not know.
+    """
+    for what in ("dilation", "groups"):
+        value = getattr(node, what)
+        if (np.ravel(value) != 1).any():
+            raise ExportError(f"the NIR node {name} has {what} {_plain(value)}, expected 1")
+    stride = _pair(name, "stride", node.stride, 1)
+    if not isinstance(node.padding, str):
+        return stride, _pair(name, "padding", node.padding, 0)
+    if node.padding == "valid":
+        return stride, (0, 0)
+    kh, kw = node.weight.shape[2:]
+    if stride != (1, 1) or kh % 2 == 0 or kw % 2 == 0:  # the two sides of an image would be padded differently
+        raise ExportError(
+            f"the NIR node {name} has padding 'same' with stride {stride} and a kernel of {kh} x {kw}, expected stride "
+            "1 and odd sides; write the padding as numbers"
+        )
+    return stride, (kh // 2, kw // 2)
+
+
+def _pair(name: str, what: str, value: Any, least: int) -> Pair:
+    pair = np.ravel(value)
+    if pair.size not in (1, 2) or (pair < least).any():
+        raise ExportError(f"the NIR node {name} has {what} {_plain(value)}, expected one or two numbers >= {least}")
+    return int(pair[0]), int(pair[-1])
+
+
+def _plain(value: Any) -> Any:
+    """A number or a list, whatever kind of array holds it."""
+    return np.asarray(value).tolist()
+
+
+def _only(graph: nir.NIRGraph, kind: type) -> str:
+    """The name of the only node of a kind."""
+    names: list[str] = [name for name, node in graph.nodes.items() if isinstance(node, kind)]
+    if len(names) != 1:
+        raise ExportError(f"the NIR graph has {len(names)} {kind.__name__} nodes, expected one")
+    return names[0]
 
 
 def _topological_order(graph: nir.NIRGraph) -> tuple[list[str], set[tuple[str, str]]]:

@@ -36,10 +36,12 @@ class LayerProfile:
         inputs: inputs of the layer.
         dense_per_decision: operations of all its passes with every input and weight counted.
         weights: its non-zero weights.
+        outputs: values that it computes at a step: its neurons, or the head's actions.
         neurons: neurons that it feeds; 0 for the head.
         spikes_T: spikes of those neurons (for an ANN: activations above zero).
         silent: neurons that never fired.
         saturated: neurons that always fired.
+        rate_histogram: neurons that fired, by spikes per step, in equal bins from 0 to 1.
         neuron_updates_per_decision: membrane updates.
         gain_multiplications_per_decision: of the active dendrites, if they are not folded into the weights.
     """
@@ -53,10 +55,12 @@ class LayerProfile:
     inputs: int
     dense_per_decision: int
     weights: int
+    outputs: int
     neurons: int
     spikes_T: tuple[int, ...]
     silent: int
     saturated: int
+    rate_histogram: tuple[int, ...]
     neuron_updates_per_decision: int
     gain_multiplications_per_decision: int
 
@@ -64,6 +68,16 @@ class LayerProfile:
     def effective_per_decision(self) -> float:
         """Mean synaptic operations."""
         return sum(self.effective_T) / self.decisions
+
+    @property
+    def macs_of_ann_twin(self) -> int:
+        """Multiplications of this layer in the ANN of the same shape: every weight at every position, once."""
+        return self.dense_per_decision // max(1, len(self.effective_T))
+
+    @property
+    def active_inputs_per_decision(self) -> float:
+        """Mean inputs that are not zero, over all passes."""
+        return sum(self.active_inputs_T) / self.decisions
 
     @property
     def spikes_per_decision(self) -> float:
@@ -103,7 +117,7 @@ class TaskProfile:
     @property
     def dense_macs_of_ann_twin(self) -> int:
         """Multiplications of the ANN of the same shape: every weight at every position, once."""
-        return sum(layer.dense_per_decision // max(1, len(layer.effective_T)) for layer in self.layers)
+        return sum(layer.macs_of_ann_twin for layer in self.layers)
 
     @property
     def spikes(self) -> float:
@@ -115,8 +129,14 @@ class TaskProfile:
         """Accumulations per synapse and decision, over the layers that spikes feed (break-even: 0.15 to 1.38,
         Dampfhoffer et al., IEEE TETCI 7(3):731, 2023)."""
         fed = [layer for layer in self.layers if layer.operation == "AC"]
-        synapses = sum(layer.dense_per_decision / max(1, len(layer.effective_T)) for layer in fed)
+        synapses = sum(layer.macs_of_ann_twin for layer in fed)
         return sum(layer.effective_per_decision for layer in fed) / synapses if fed else 0.0
+
+    @property
+    def rate(self) -> float:
+        """Spikes per neuron and simulation step (break-even with a quantised ANN: 0.057 at T = 5, arXiv 2409.08290)."""
+        neurons = sum(layer.neurons for layer in self.layers)
+        return self.spikes / (neurons * self.timesteps)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -133,6 +153,7 @@ class TaskProfile:
                 "gain_multiplications": sum(layer.gain_multiplications_per_decision for layer in self.layers),
             },
             "spikes_per_synapse": self.spikes_per_synapse,
+            "rate": self.rate,
             "twins": {
                 "ann": {"macs": macs},
                 "quantised_ann": {"macs": macs, "activation_bits": math.log2(self.timesteps + 1)},
@@ -180,7 +201,7 @@ def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> Tas
 
 def _synapses(network: FoldedNetwork, layer: Layer, task: int) -> Synapses:
     first = layer is network.layers[0]
-    spikes_in = network.config.network.encoding in ("rate", "latency", "events") if first else network.spiking
+    spikes_in = network.sees_spikes if first else network.spiking
     weight, _ = layer.folded(task)
     stride = layer.stride or 1
     shape = layer.input_shape
@@ -189,15 +210,21 @@ def _synapses(network: FoldedNetwork, layer: Layer, task: int) -> Synapses:
     return Synapses(layer.name, weight, shape, spikes_in, stride=(stride, stride))
 
 
-def _layer_profile(
-    network: FoldedNetwork, layer: Layer, counter: SynapseCounter, neurons: NeuronCounter | None
+def layer_profile(
+    counter: SynapseCounter, neurons: NeuronCounter | None, outputs: int, updates: int, gain_multiplications: int = 0
 ) -> LayerProfile:
-    steps = network.config.network.timesteps
-    count = int(np.prod(layer.output_shape)) if neurons is not None else 0
-    gated = network.config.network.dendrites in ("shared", "per_neuron") and layer.name == "hidden"
+    """What the two counters of a layer hold.
+
+    Args:
+        counter: of its synapses.
+        neurons: of the neurons that they feed; None for a head.
+        outputs: values that it computes at a step.
+        updates: neuron updates per decision.
+        gain_multiplications: per decision.
+    """
     return LayerProfile(
-        name=layer.name,
-        convolution=layer.is_convolution,
+        name=counter.synapses.name,
+        convolution=counter.synapses.weight.ndim == 4,
         operation=counter.synapses.operation,
         decisions=counter.decisions,
         effective_T=tuple(counter.operations_T.tolist()),
@@ -205,10 +232,21 @@ def _layer_profile(
         inputs=len(counter.fan_out),
         dense_per_decision=counter.synapses.dense_operations() * len(counter.operations_T),
         weights=int(np.count_nonzero(counter.synapses.weight)),
-        neurons=count,
+        outputs=outputs,
+        neurons=outputs if neurons is not None else 0,
         spikes_T=tuple(neurons.spikes_TN.sum(axis=1).tolist()) if neurons is not None else (),
         silent=neurons.silent if neurons is not None else 0,
         saturated=neurons.saturated if neurons is not None else 0,
-        neuron_updates_per_decision=count * steps if network.spiking else 0,
-        gain_multiplications_per_decision=count * steps if gated else 0,
+        rate_histogram=neurons.rate_histogram if neurons is not None else (),
+        neuron_updates_per_decision=updates,
+        gain_multiplications_per_decision=gain_multiplications,
     )
+
+
+def _layer_profile(
+    network: FoldedNetwork, layer: Layer, counter: SynapseCounter, neurons: NeuronCounter | None
+) -> LayerProfile:
+    steps, outputs = network.config.network.timesteps, int(np.prod(layer.output_shape))
+    gated = network.config.network.dendrites in ("shared", "per_neuron") and layer.name == "hidden"
+    updates = outputs * steps if network.spiking and neurons is not None else 0
+    return layer_profile(counter, neurons, outputs, updates, outputs * steps if gated else 0)

@@ -10,14 +10,12 @@ from typing import Any
 from switchmt_snn import __version__
 
 
-def provenance(run: Path) -> dict[str, Any]:
-    """Tool and version, git commit of its source, and the SHA-256 of the run's config."""
-    config = (run / "config.yaml").read_bytes()
-    return {
-        "tool": f"switchmt-snn {__version__}",
-        "git_commit": _git_commit(),
-        "config_sha256": hashlib.sha256(config).hexdigest(),
-    }
+def provenance(run: Path | None = None) -> dict[str, Any]:
+    """Tool and version, git commit of its source, and the SHA-256 of the run's config, if there is a run."""
+    facts = {"tool": f"switchmt-snn {__version__}", "git_commit": _git_commit()}
+    if run is not None:
+        facts["config_sha256"] = hashlib.sha256((run / "config.yaml").read_bytes()).hexdigest()
+    return facts
 
 
 def _git_commit() -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import re
+import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,10 +86,10 @@ def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Reco
 
 def _read(path: Path, task: str, shape: tuple[int, ...]) -> Recording:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             observations, actions = stored["observations"], stored["actions"]
             recording = Recording(task, observations, actions, float(stored["epsilon"]), int(stored["seed"]))
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ExportError(f"recorded play {path} cannot be read ({error}), expected an .npz file; delete it") from error
     if observations.shape[1:] != shape:
         raise ExportError(f"recorded play {path} has shape {observations.shape[1:]}, expected {shape}; delete it")

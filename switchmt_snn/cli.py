@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 from rich.console import Console
@@ -24,7 +24,7 @@ usage: switchmt-snn COMMAND [options]
   train [CONFIG]      train, or continue a run (CONFIG: a YAML file or a preset; default: quickstart)
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
-  profile [RUN]       spikes, operations and energy by layer and task on recorded play (default: newest run)
+  profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   doctor              versions, games and devices of this installation
 
@@ -99,11 +99,13 @@ class ProfileOptions:
     decisions: int = 1000
     """Recorded decisions per task."""
     target: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A built-in target or a YAML file; may be given several times. Default: all built-in ones."""
+    """A built-in energy target, a chip, or a YAML file; may be given several times. Default: all built-in ones."""
     checkpoint: Literal["last", "best"] = "last"
     """Which weights."""
+    observations: Path | None = None
+    """For a NIR file: an .npz file with observations [N, ...] or encoded inputs [T, N, ...]."""
     out: Path | None = None
-    """Folder to write to. Default: the run's profile/."""
+    """Folder to write to. Default: the run's profile/; of several runs: the first one's."""
     json: bool = False
     """Print the profile as JSON."""
 
@@ -296,24 +298,51 @@ def _export(argv: list[str]) -> int:
 
 
 def _profile(argv: list[str]) -> int:
-    run, rest = _leading_name(argv)
+    names, rest = _leading_names(argv)
     options = _parse(ProfileOptions, rest, "profile", ProfileOptions())
-    from switchmt_snn.export import profile
-    from switchmt_snn.viewing.tables import energy_table, profile_table
+    from switchmt_snn.export import Profile, compare_profiles, profile, profile_file
 
-    path = Path(run) if run is not None else None
-    result = profile(path, options.decisions, options.checkpoint, options.out, options.target)
-    facts = result.to_dict()
+    files = [name for name in names if name.endswith(".nir")]
+    if (options.observations is not None) != bool(files):
+        raise ConfigError(
+            "a NIR file and --observations belong together, expected switchmt-snn profile FILE.nir --observations "
+            "FILE.npz; a run has recorded observations of its own"
+        )
+    profiles: list[Profile] = []
+    # With several, --out is the comparison's; each one's own files lie in its own folder.
+    out = options.out if len(names) < 2 else None
+    chosen: list[str | None] = [*names] or [None]  # None is the newest run
+    for name in chosen:
+        if name is not None and name in files:
+            profiles.append(profile_file(name, cast(Path, options.observations), out, options.target))
+        else:
+            profiles.append(profile(name, options.decisions, options.checkpoint, out, options.target))
+    report = profiles[0].folder / "report.html"
+    if len(profiles) > 1:
+        report = compare_profiles(profiles, options.out)
     if options.json:
-        print(json.dumps(facts))
+        facts = [one.facts for one in profiles]
+        print(json.dumps(facts[0] if len(facts) == 1 else facts))
         return 0
-    console = Console()
-    console.print(facts["headline"], soft_wrap=True)
-    for task in facts["tasks"]:
-        console.print(profile_table(task))
-    console.print(energy_table(facts))
-    print(result.folder)
+    _print_profiles([one.facts for one in profiles])
+    print(report)
     return 0
+
+
+def _print_profiles(profiles: list[dict[str, Any]]) -> None:
+    from switchmt_snn.viewing.tables import comparison_table, energy_table, fit_table, profile_table
+
+    console = Console()
+    if len(profiles) > 1:
+        console.print(comparison_table(profiles))
+    for facts in profiles:
+        console.print(facts["headline"], soft_wrap=True)
+        for task in facts["tasks"]:
+            console.print(profile_table(task))
+        if facts["targets"]:
+            console.print(energy_table(facts))
+        if facts["chips"]:
+            console.print(fit_table(facts))
 
 
 def _describe(argv: list[str]) -> int:
@@ -361,6 +390,12 @@ def _doctor(argv: list[str]) -> int:
         shown = ", ".join(f"{k} {v or 'not installed'}" for k, v in value.items()) if isinstance(value, dict) else value
         print(f"{key}: {shown}")
     return 0
+
+
+def _leading_names(argv: list[str]) -> tuple[list[str], list[str]]:
+    """The positional arguments, which come first if they are there."""
+    count = next((index for index, word in enumerate(argv) if word.startswith("-")), len(argv))
+    return argv[:count], argv[count:]
 
 
 def _leading_name(argv: list[str]) -> tuple[str | None, list[str]]:

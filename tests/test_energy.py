@@ -26,14 +26,16 @@ def layer(name: str, operation: str, effective: int, dense: int, neurons: int, s
         operation=operation,
         decisions=10,
         effective_T=(effective // steps,) * steps,
-        active_inputs_T=(0,) * steps,
+        active_inputs_T=(30,) * steps,
         inputs=5,
         dense_per_decision=dense * steps,
         weights=100,
+        outputs=neurons or 2,
         neurons=neurons,
         spikes_T=(spikes // 2,) * 2,
         silent=0,
         saturated=0,
+        rate_histogram=(neurons,) if neurons else (),
         neuron_updates_per_decision=2 * neurons,
         gain_multiplications_per_decision=0,
     )
@@ -71,7 +73,11 @@ def test_by_hand() -> None:
 def test_what_has_no_price_is_named_and_not_guessed() -> None:
     energy = estimate(TASK, read_target(make(operations={"ac": 2.0, "ac_conv": 1.0, "spike": 5.0}, unit="nJ"), "t"))
     assert energy.compute_pj == pytest.approx(48e3 + 8 * 5e3)  # 24 accumulations, 6 + 2 spikes
-    assert energy.not_included == ("40 multiplications of conv1", "24 neuron updates")
+    assert energy.not_included == (
+        "40 multiplications of conv1",
+        "16 neuron updates of conv1",
+        "8 neuron updates of hidden",
+    )
     assert energy.by_ann is None
 
 
@@ -82,8 +88,26 @@ def test_memory_is_read_for_every_operation() -> None:
     assert memory.access_pj(10**9, 8) == pytest.approx(100 / 8), "beyond the table: its largest"
     raw = {"access_bits": 64, "energy_by_kilobytes": {8: 10}, "weight_bits": 8, "state_bits": 16}
     energy = estimate(TASK, read_target(make(memory=raw), "t"))
-    assert energy.memory_pj == pytest.approx((40 + 20 + 4) * 10 / 8 + 2 * 24 * 10 / 4)
-    assert energy.ann_memory_pj == pytest.approx(86 * 10 / 8 + 12 * 10 / 4)
+    weight, state = 10 / 8, 10 / 4  # pJ per access of 8 and 16 bits
+    # Per decision: a first convolution (40 operations, 8 neurons of 2 steps, 6 spikes), a hidden layer that 6 spikes
+    # feed (20 operations, 4 neurons, 2 spikes), a head of 2 actions that 6 spikes feed (4 operations).
+    conv1, hidden, head = energy.layers
+    assert conv1.memory_pj == pytest.approx(
+        {"events": 6 * state, "activations": 40 * state, "weights": 40 * weight, "biases": 8 * weight}
+        | {"state": 2 * 16 * state}
+    )
+    assert hidden.memory_pj == pytest.approx(
+        {"events": (6 + 2) * state, "activations": 0, "weights": 20 * weight, "biases": 8 * weight}
+        | {"state": 2 * (20 + 8) * state}
+    )
+    assert head.memory_pj == pytest.approx(
+        {"events": 6 * state, "activations": 2 * state, "weights": 4 * weight, "biases": 4 * weight}
+        | {"state": 2 * (4 + 4) * state}
+    )
+    assert energy.memory_pj == pytest.approx(sum(sum(layer.memory_pj.values()) for layer in energy.layers))
+    # The ANN: a convolution reads an input per multiplication, a linear layer each of its 5 once.
+    reads, written, biases = 50 + 5 + 5, 8 + 4 + 2, 8 + 4 + 2
+    assert energy.ann_memory_pj == pytest.approx((reads + written) * state + (86 + biases) * weight)
 
 
 def test_built_in_targets_have_origin_and_price() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,11 @@ from torch import nn
 
 from switchmt_snn.config import METHOD_TRAITS
 from switchmt_snn.errors import ExportError
+from switchmt_snn.export import profile
+from switchmt_snn.export.fold import fold
+from switchmt_snn.export.precision import at_precision, effect_of_precision
 from switchmt_snn.export.profile import profile_task
+from switchmt_snn.learning.run import load_agent
 from tests.export_cases import VARIANTS, make_agent, observations
 from tests.test_export_command import call, run, trained  # noqa: F401
 
@@ -117,7 +122,7 @@ def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, _ = call(capsys, "profile", run, "--decisions", 50)
     assert "breakout: per decision, mean of 52" in out
     facts = json.loads((run / "profile" / "profile.json").read_text())
-    assert facts["schema"] == 1
+    assert facts["schema"] == 2
     with (run / "profile" / "layers.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     for task in facts["tasks"]:
@@ -130,3 +135,75 @@ def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(out) == facts
     _, err = call(capsys, "profile", run, "--decisions", 0, code=2)
     assert "decisions is 0, expected at least 1" in err
+
+
+def test_chips_and_targets_are_chosen_by_name(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    out, _ = call(capsys, "profile", run, "--decisions", 20, "--target", "speck")
+    assert "speck" in out
+    facts = json.loads((run / "profile" / "profile.json").read_text())
+    assert ([chip["chip"] for chip in facts["chips"]], facts["targets"]) == (["speck"], {})
+    assert facts["chips"][0]["fits"], "16 hidden units of a MinAtar network"
+    assert facts["tasks"][0]["precision"][0]["bits"] == 8
+    _, err = call(capsys, "profile", run, "--target", "spekc", code=2)
+    assert "unknown target 'spekc'; did you mean 'speck'" in err
+
+
+def test_energy_per_episode_needs_an_evaluation_at_this_step(run: Path) -> None:  # noqa: F811
+    (row,) = [
+        row
+        for path in (run / "evaluations").glob("*.json")
+        for row in json.loads(path.read_text())["tasks"]
+        if (row["policy"], row["task"]) == ("agent", "breakout")
+    ]
+    task = profile(run, decisions=20).facts["tasks"][0]
+    assert task["decisions_per_episode"] == row["mean_length_steps"]
+    assert task["energy"][0]["per_episode_pj"] == task["energy"][0]["total_pj"] * row["mean_length_steps"]
+    shutil.rmtree(run / "evaluations")
+    task = profile(run, decisions=20).facts["tasks"][0]
+    assert (task["decisions_per_episode"], task["energy"][0]["per_episode_pj"]) == (None, None)
+
+
+def test_rounded_weights_are_those_of_a_layers_own_step() -> None:
+    agent = make_agent()
+    for task in range(3):
+        rounded = at_precision(fold(agent), task, 8)
+        for layer in rounded.layers:
+            weight, shift = layer.folded(task)
+            original, expected_shift = next(x for x in fold(agent).layers if x.name == layer.name).folded(task)
+            step = np.abs(original).max() / 127
+            steps = np.abs(weight / step)
+            assert np.allclose(steps, np.rint(steps), atol=1e-3)
+            assert steps.max() == pytest.approx(127)
+            assert np.abs(weight - original).max() <= step * 0.5001
+            assert np.array_equal(shift, expected_shift)
+    coarse, fine = (effect_of_precision(agent, 0, bits, observations(agent, 100)) for bits in (3, 16))
+    assert fine.equal_actions_share > coarse.equal_actions_share
+    assert fine.decisions_with_flips < coarse.decisions_with_flips
+
+
+def test_bad_profiles_are_refused_in_one_line(
+    run: Path,  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, err = call(capsys, "profile", tmp_path / "nothing.nir", "--observations", tmp_path / "x.npz", code=2)
+    assert "cannot be read" in err
+    _, err = call(capsys, "profile", run, "--observations", tmp_path / "x.npz", code=2)
+    assert "belong together" in err
+    _, err = call(capsys, "profile", tmp_path / "graph.nir", code=2)
+    assert "belong together" in err
+    recording = run / "recordings" / "breakout-step-600.npz"
+    recording.parent.mkdir(exist_ok=True)
+    recording.write_bytes(b"PK damaged")
+    _, err = call(capsys, "profile", run, code=2)
+    assert "cannot be read" in err
+
+
+def test_weights_that_are_not_numbers_are_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    agent = load_agent(run, "last", "cpu")
+    with torch.no_grad():
+        agent.network.streams["value"].head.weight[0, 0] = torch.nan
+    monkeypatch.setattr("switchmt_snn.export.profiling.load_agent", lambda *_: agent)
+    with pytest.raises(ExportError, match="not finite"):
+        profile(run)
+    assert not (run / "profile").exists()

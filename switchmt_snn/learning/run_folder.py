@@ -293,7 +293,7 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
             versions[package] = None
     return {
         "program": "switchmt-snn",
-        "command": _command(),
+        "command": command_line(),
         "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -311,7 +311,7 @@ def _evaluation_stem(step: int) -> str:
     return f"step-{step:012d}"
 
 
-def _command() -> str:
+def command_line() -> str:
     """The command line without the folder in which the program lies; ``python`` for a library call."""
     program = Path(sys.argv[0]).name
     ours = program in ("switchmt-snn", "__main__.py")

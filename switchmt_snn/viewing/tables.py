@@ -147,6 +147,53 @@ def energy_table(profile: dict[str, Any]) -> Table:
     return table
 
 
+def fit_table(profile: dict[str, Any]) -> Table:
+    """Which chips hold the network, the layer that is furthest over a limit, and what rounding weights does."""
+    effects = [
+        f"{effect['equal_actions_share']:.1%} in {task['task']}"
+        for task in profile["tasks"]
+        for effect in task["precision"]
+    ]
+    bits = ", ".join(dict.fromkeys(str(chip["weight_bits"]) for chip in profile["chips"]))
+    table = _table(
+        "Will it fit? Public limits of memory and size, layer by layer (all of them: report.html)",
+        f"Same action with weights of {bits} bits: {', '.join(effects)}.",
+    )
+    _add_columns(table, ("chip", "fits", "tightest"), ())
+    table.add_column("needs, of what there is")
+    for chip in profile["chips"]:
+        limits = [(layer["layer"], limit) for layer in chip["layers"] for limit in layer["limits"]]
+        limits += [("whole chip", limit) for limit in chip["limits"]]
+        where, limit = max(limits, key=lambda pair: pair[1]["needs"] / pair[1]["has"])
+        needs, has = (_three_digits(limit[key]) for key in ("needs", "has"))
+        unit = "" if limit["unit"] == limit["resource"] else f" {limit['unit']},"
+        amount = f"{needs} of {has}{unit} {limit['resource']}"
+        table.add_row(chip["chip"], _yes(chip["fits"]), where, amount)
+    return table
+
+
+def comparison_table(profiles: list[dict[str, Any]]) -> Table:
+    """Several runs side by side, a column each."""
+    table = _table("Per decision, smallest to largest over tasks and targets")
+    table.add_column("")
+    for profile in profiles:
+        table.add_column(profile["run"], justify="right")
+    for label, key, unit in (
+        ("spikes", "spikes", 1.0),
+        ("per neuron and step", "rate", 1.0),
+        ("energy (µJ)", "total_pj", 1e6),
+        ("x ANN", "by_ann", 1.0),
+        ("x QANN", "by_quantised_ann", 1.0),
+    ):
+        table.add_row(label, *(_span(profile["summary"][key], unit) for profile in profiles))
+    return table
+
+
+def _span(values: dict[str, float | None], unit: float) -> str:
+    known = [_three_digits(value / unit) for value in values.values() if value is not None]
+    return " to ".join(dict.fromkeys(known))
+
+
 def _three_digits(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
