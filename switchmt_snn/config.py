@@ -210,6 +210,10 @@ class LearningConfig:
     """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576
     """Transitions kept per task."""
+    replay_compression: Literal["auto", "zstd", "none"] = "auto"
+    """Keep frames compressed, without loss and with the same samples. auto: if plain ones would take over 1 GiB."""
+    replay_max_gib: float = 4.0
+    """Compressed frames of all tasks together take no more; while they would, the oldest leave."""
     learning_starts_steps: int = 512
     """Transitions that a task must hold before it is sampled; until then its actions are random."""
     update_every_steps: int = 1
@@ -233,6 +237,7 @@ class LearningConfig:
         _require(self.adam_epsilon > 0, "learning.adam_epsilon", self.adam_epsilon, "above 0")
         _require(0.0 <= self.discount <= 1.0, "learning.discount", self.discount, "within [0, 1]")
         _require(self.gradient_clip_at > 0, "learning.gradient_clip_at", self.gradient_clip_at, "above 0")
+        _require(self.replay_max_gib > 0, "learning.replay_max_gib", self.replay_max_gib, "above 0")
         for name in ("replay_capacity_steps", "update_every_steps", "target_update_every_steps", "epsilon_decay_steps"):
             value = getattr(self, name)
             _require(value >= 1, f"learning.{name}", value, "at least 1")

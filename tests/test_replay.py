@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from switchmt_snn.learning.replay import SEGMENT_SLOTS, FrameReplay, Segment
+from switchmt_snn.learning.replay import BLOCK_SLOTS, SEGMENT_SLOTS, FrameReplay, Segment
 
 
 @dataclass
@@ -50,7 +50,12 @@ class NaiveLane:
         )
 
     def held(self) -> list[dict]:
-        return [t for t in self.transitions if t["oldest"] >= self.written - self.slots]
+        """Frames leave in whole blocks, when the first slot of theirs is overwritten."""
+        block = BLOCK_SLOTS if self.slots >= 8 * BLOCK_SLOTS else 1
+        newest = self.written - 1
+        start = newest - newest % self.slots % block
+        oldest = max(0, start - self.slots + min(block, self.slots - start % self.slots))
+        return [t for t in self.transitions if t["oldest"] >= oldest]
 
 
 def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator, operations: int) -> None:
@@ -94,24 +99,28 @@ def compare(replay: FrameReplay, lanes: list[NaiveLane]) -> None:
 @settings(max_examples=60, deadline=None)
 @given(
     num_lanes=st.integers(1, 3),
-    slots=st.integers(6, 40),
+    slots=st.integers(6, 40) | st.integers(8 * BLOCK_SLOTS, 300),
     stack=st.integers(1, 5),
-    operations=st.integers(0, 300),
+    operations=st.integers(0, 1000),
     seed=st.integers(0, 2**31),
+    compressed=st.booleans(),
 )
-def test_equals_naive_list(num_lanes: int, slots: int, stack: int, operations: int, seed: int) -> None:
+def test_equals_naive_list(
+    num_lanes: int, slots: int, stack: int, operations: int, seed: int, compressed: bool
+) -> None:
     shape = (2, 3)
-    replay = FrameReplay(slots * num_lanes, num_lanes, shape, np.uint8, stack)
+    replay = FrameReplay(slots * num_lanes, num_lanes, shape, np.uint8, stack, compressed)
     lanes = [NaiveLane(slots, stack, shape) for _ in range(num_lanes)]
     drive(replay, lanes, np.random.default_rng(seed), operations)
     compare(replay, lanes)
 
 
+@pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("slots", [700, SEGMENT_SLOTS, 2500])
-def test_stored_and_loaded_is_the_same(slots: int) -> None:
+def test_stored_and_loaded_is_the_same(slots: int, compressed: bool) -> None:
     """Segments of an older moment plus those written since give the ring back, also after it went round."""
     shape = (1, 2)
-    replay = FrameReplay(2 * slots, 2, shape, np.uint8, 4)
+    replay = FrameReplay(2 * slots, 2, shape, np.uint8, 4, compressed)
     lanes = [NaiveLane(slots, 4, shape) for _ in range(2)]
     rng = np.random.default_rng(0)
     stored: dict[Segment, np.ndarray] = {}
@@ -120,7 +129,7 @@ def test_stored_and_loaded_is_the_same(slots: int) -> None:
         for segment in replay.segments():
             if segment not in stored or not segment.complete:
                 stored[segment] = replay.read_segment(segment).copy()
-    copy = FrameReplay(2 * slots, 2, shape, np.uint8, 4)
+    copy = FrameReplay(2 * slots, 2, shape, np.uint8, 4, compressed)
     copy.load_state_dict(replay.state_dict())
     for segment in replay.segments():
         copy.load_segment(segment, stored[segment])
@@ -128,6 +137,60 @@ def test_stored_and_loaded_is_the_same(slots: int) -> None:
     one, two = (r.sample(64, np.random.default_rng(3)) for r in (replay, copy))
     assert np.array_equal(one.observations, two.observations)
     assert np.array_equal(one.next_observations, two.next_observations)
+    assert copy.nbytes == replay.nbytes
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.bool_, np.float32])
+@pytest.mark.parametrize("shape", [(1, 84, 84), (6, 10, 10), (4,)])
+def test_compressed_equals_plain(dtype: type, shape: tuple[int, ...]) -> None:
+    """The same operations, samples and bytes, for frames that change little and for noise."""
+    plain, compressed = (FrameReplay(400, 2, shape, dtype, 4, c) for c in (False, True))
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 2, shape).astype(dtype) * rng.normal(size=shape).astype(dtype) for _ in range(40)]
+    for replay in (plain, compressed):
+        script = np.random.default_rng(1)
+        for lane in range(2):
+            replay.begin(lane, frames[0])
+        for step in range(1200):
+            lane, end = int(script.integers(2)), bool(script.random() < 0.05)
+            replay.add(lane, step % 18, float(step), end, frames[int(script.integers(40))])
+            if end:
+                replay.begin(lane, frames[1])
+            if step in (5, 100, 1199):
+                kept = replay.sample(50, np.random.default_rng(step))
+                other = plain.sample(50, np.random.default_rng(step)) if step == 1199 else kept
+                for one, two in zip(vars(kept).values(), vars(other).values(), strict=True):
+                    assert np.array_equal(one, two)
+                    assert one.dtype == two.dtype
+    compressed.check_valid()
+
+
+def test_noise_stays_below_the_cap_and_what_is_left_is_right() -> None:
+    """Frames that do not compress: the oldest blocks leave, in storing and after loading alike."""
+    shape, cap = (1, 16, 16), 60_000
+    replay = FrameReplay(1200, 2, shape, np.uint8, 3, compressed=True, max_bytes=cap)
+    rng = np.random.default_rng(0)
+    frames: list[dict[float, np.ndarray]] = [{}, {}]
+    for lane in range(2):
+        replay.begin(lane, rng.integers(0, 256, shape, np.uint8))
+    largest = 0
+    for step in range(3000):
+        lane, frame = int(rng.integers(2)), rng.integers(0, 256, shape, np.uint8)
+        frames[lane][float(step)] = frame
+        replay.add(lane, 0, step, False, frame)
+        largest = max(largest, replay.nbytes - 9 * 1200)
+        if step == 1500:
+            copy = FrameReplay(1200, 2, shape, np.uint8, 3, compressed=True, max_bytes=cap)
+            copy.load_state_dict(replay.state_dict())
+            for segment in replay.segments():
+                copy.load_segment(segment, replay.read_segment(segment))
+            replay = copy
+    assert largest <= cap
+    assert 100 < len(replay) < 300, "60 kB of 256-byte frames"
+    replay.check_valid()
+    batch = replay.gather(replay.valid_slots())
+    for next_observation, reward in zip(batch.next_observations, batch.rewards, strict=True):
+        assert any(np.array_equal(next_observation[-1:], of_lane.get(float(reward))) for of_lane in frames)
 
 
 def test_sampling_is_uniform_and_seeded() -> None:

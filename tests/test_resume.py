@@ -33,6 +33,8 @@ learning:
   batch_size: 8
   learning_starts_steps: 50
   replay_capacity_steps: 700
+  replay_compression: zstd
+  replay_max_gib: 0.00009
   update_every_steps: 4
   target_update_every_steps: 100
   epsilon_decay_steps: 800
@@ -101,6 +103,22 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> N
     """Until something is there, or the process has ended."""
     while process.poll() is None and not condition():
         time.sleep(0.005)
+
+
+def test_compression_changes_nothing(config: Path, tmp_path: Path) -> None:
+    for kind in ("none", "zstd"):
+        options = ("--learning.replay-compression", kind, "--learning.replay-max-gib", "1")
+        run("train", config, "--run", tmp_path / kind, *options)
+    assert content(tmp_path / "none") == content(tmp_path / "zstd")
+
+
+def test_the_cap_of_the_replay_was_reached(whole: Path) -> None:
+    """So that the other tests here continue a run whose oldest frames have left early."""
+    last = max(whole.glob("checkpoints/step-*"))
+    tensors = safetensors.torch.load_file(last / "training.safetensors")
+    oldest = [value for name, value in tensors.items() if name.endswith("oldest")]
+    written = [value for name, value in tensors.items() if name.endswith("written")]
+    assert any((w - o < 300).any() for o, w in zip(oldest, written, strict=True)), "rings of 350 slots per lane"
 
 
 def test_killed_at_random_moments_ends_bitwise_the_same(config: Path, whole: Path, tmp_path: Path) -> None:

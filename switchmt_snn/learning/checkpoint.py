@@ -27,7 +27,7 @@ from switchmt_snn.errors import CheckpointError
 from switchmt_snn.learning.files import sha256, sync_folder, write_atomically
 from switchmt_snn.learning.replay import FrameReplay, Segment
 
-FORMAT = 2
+FORMAT = 3
 """Goes up when a saved state gets another shape. 2: paused episodes of every task. Weights are read from any."""
 _STEP_DIGITS = 12
 
@@ -194,7 +194,7 @@ class CheckpointStore:
         for entry, content in zip(manifest["segments"], contents, strict=True):
             replay = replays[entry["task"]]
             segment = Segment(entry["lane"], entry["number"], complete=True)
-            frames = np.frombuffer(content, replay.frame_dtype).reshape(-1, *replay.frame_shape)
+            frames = np.frombuffer(zstandard.decompress(content), replay.frame_dtype).reshape(-1, *replay.frame_shape)
             replay.load_segment(segment, frames)
         complete = {(task, s.lane, s.number) for task, r in enumerate(replays) for s in r.segments() if s.complete}
         keyed = {(entry["task"], entry["lane"], entry["number"]): entry for entry in manifest["segments"]}
@@ -221,7 +221,7 @@ class CheckpointStore:
             raise CheckpointError(f"replay segment {path.name[:12]} cannot be read") from error
         if sha256(content) != entry["sha256"]:
             raise CheckpointError(f"replay segment {path.name[:12]} has another checksum")
-        return zstandard.decompress(content)
+        return content
 
     def load_model(self, which: str = "last") -> tuple[int, dict[str, torch.Tensor], tuple[str, ...]]:
         """Weights of the last whole checkpoint or of the best one: step, state dict, damaged checkpoints passed over.

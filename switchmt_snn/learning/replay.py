@@ -5,6 +5,9 @@ Shapes: L lanes (one per environment copy), N slots per lane, B batch, k stacked
 A lane is a ring of slots. A slot holds a frame and, if the agent acted on it, what followed: the transition's next
 frame is the next slot's. The last frame of an episode has a slot of its own without an action, so the next observation
 is right at termination and truncation, and no stack crosses an episode border (frames before the start are zeros).
+
+Old frames leave in blocks of a few slots: when the first slot of a block is overwritten, and the oldest while frames
+take more bytes than they may. Frames lie plain or compressed (:mod:`switchmt_snn.learning.frames`), else all is alike.
 """
 
 from __future__ import annotations
@@ -16,6 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from switchmt_snn.learning.frames import CompressedFrames, FrameStore, PlainFrames
+
+BLOCK_SLOTS = 16
+"""Frames that leave, and are compressed, together. Fewer take more bytes; of more, one frame takes longer to read."""
 SEGMENT_SLOTS = 1024
 """Slots per stored segment (see :meth:`FrameReplay.segments`)."""
 
@@ -47,10 +54,17 @@ class FrameReplay:
         transitions_added: transitions ever added.
     """
 
-    DERIVED = ("stack", "slots", "num_lanes", "_zero_slot")
+    DERIVED = ("stack", "slots", "num_lanes", "block_slots", "max_bytes", "_frames", "frame_shape", "frame_dtype")
 
     def __init__(
-        self, capacity_steps: int, num_lanes: int, frame_shape: tuple[int, ...], dtype: npt.DTypeLike, stack: int
+        self,
+        capacity_steps: int,
+        num_lanes: int,
+        frame_shape: tuple[int, ...],
+        dtype: npt.DTypeLike,
+        stack: int,
+        compressed: bool = False,
+        max_bytes: int | None = None,
     ) -> None:
         """Reserve the ring; the system hands out its memory as frames come in.
 
@@ -60,20 +74,29 @@ class FrameReplay:
             frame_shape: one frame, ``(c, H, W)`` or ``(features,)``.
             dtype: of a frame.
             stack: frames k per observation.
+            compressed: keep frames compressed, without loss.
+            max_bytes: the oldest blocks leave while compressed frames take more.
         """
         self.stack = stack
         self.slots = capacity_steps // num_lanes
         self.num_lanes = num_lanes
+        self.frame_shape, self.frame_dtype = frame_shape, np.dtype(dtype)
+        # A ring of few slots cannot do without many of them at once.
+        self.block_slots = BLOCK_SLOTS if self.slots >= 8 * BLOCK_SLOTS else 1
+        self.max_bytes = max_bytes if compressed else None
+        self._frames: FrameStore = (
+            CompressedFrames(num_lanes, self.slots, frame_shape, dtype, self.block_slots)
+            if compressed
+            else PlainFrames(num_lanes, self.slots, frame_shape, dtype)
+        )
         flat = self.slots * num_lanes
-        # One slot more, always zero: stands for the frames before an episode's start.
-        self._frames = np.zeros((flat + 1, *frame_shape), dtype)
-        self._zero_slot = flat
         self._actions = np.full(flat, -1, np.int16)
         self._rewards = np.zeros(flat, np.float32)
         self._terminated = np.zeros(flat, np.bool_)
         self._age = np.zeros(flat, np.uint8)  # steps since the episode's start, at most stack - 1
         self._valid = np.zeros(flat, np.bool_)  # a transition whose frames are all still there
         self._written = np.zeros(num_lanes, np.int64)  # slots ever written, per lane
+        self._oldest = np.zeros(num_lanes, np.int64)  # position of the oldest frame held, per lane
         self.transitions_added = 0
 
     def __len__(self) -> int:
@@ -81,14 +104,9 @@ class FrameReplay:
         return int(self._valid.sum())
 
     @property
-    def frame_shape(self) -> tuple[int, ...]:
-        """Shape of one frame."""
-        return self._frames.shape[1:]
-
-    @property
-    def frame_dtype(self) -> np.dtype[Any]:
-        """Type of a frame."""
-        return self._frames.dtype
+    def nbytes(self) -> int:
+        """Bytes of everything that is held: frames, actions, rewards, flags."""
+        return self._frames.nbytes + sum(array.nbytes for array in self._arrays().values())
 
     def begin(self, lane: int, frame: npt.NDArray[Any]) -> None:
         """Start an episode in a lane with its first frame; what came before keeps its last frame."""
@@ -110,18 +128,37 @@ class FrameReplay:
     def _write(self, lane: int, frame: npt.NDArray[Any], age: int) -> None:
         position = int(self._written[lane])
         slot = self._slot(lane, position)
-        # Overwriting a frame spoils every later transition whose stack reaches back to it.
-        for distance in range(1, self.stack):
-            later = self._slot(lane, position + distance)
-            if self._age[later] >= distance:
-                self._valid[later] = False
+        if position >= self.slots and position % self.slots % self.block_slots == 0:
+            self._drop_before(lane, position - self.slots + self._block_length(position))
         self._valid[slot] = False
         self._actions[slot] = -1
         self._rewards[slot] = 0.0
         self._terminated[slot] = False
-        self._frames[slot] = frame
+        self._frames.write(lane, position % self.slots, frame)
         self._age[slot] = age
         self._written[lane] = position + 1
+        while self.max_bytes is not None and self._frames.nbytes > self.max_bytes:
+            held = self._written - self._oldest
+            fullest = int(held.argmax())
+            if held[fullest] <= 2 * self.block_slots + self.stack:
+                break  # less than that is no memory; the open blocks alone take as much
+            oldest = int(self._oldest[fullest])
+            self._frames.drop(fullest, oldest % self.slots)
+            self._drop_before(fullest, oldest + self._block_length(oldest))
+
+    def _block_length(self, position: int) -> int:
+        """Slots of the block at whose start a position is; the last block of a lane may be shorter."""
+        return min(self.block_slots, self.slots - position % self.slots)
+
+    def _drop_before(self, lane: int, oldest: int) -> None:
+        """Make ``oldest`` the oldest position held; spoils every transition that needs an older frame."""
+        gone = np.arange(int(self._oldest[lane]), oldest)
+        self._valid[self._slot(lane, gone)] = False
+        for distance in range(self.stack - 1):
+            later = self._slot(lane, oldest + distance)
+            if self._age[later] > distance:
+                self._valid[later] = False
+        self._oldest[lane] = max(int(self._oldest[lane]), oldest)
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """Draw transitions uniformly, with replacement.
@@ -146,7 +183,7 @@ class FrameReplay:
         back = np.arange(k - 1, -2, -1)[None, :]  # k-1 ... 0 for the observation, -1 for the next frame
         sources = lanes_B1 * self.slots + (within_B1 - back) % self.slots
         before_start = back > self._age[slots][:, None]
-        frames = self._frames[np.where(before_start, self._zero_slot, sources)]  # [B, k+1, c, ...]
+        frames = self._frames.read(np.where(before_start, -1, sources))  # [B, k+1, c, ...]
         shape = (len(slots), k * frames.shape[2], *frames.shape[3:])
         return Batch(
             observations=frames[:, :k].reshape(shape),
@@ -166,6 +203,7 @@ class FrameReplay:
         """Everything but the frames."""
         return {
             "written": self._written.copy(),
+            "oldest": self._oldest.copy(),
             "transitions_added": self.transitions_added,
             **{name: np.concatenate(list(self._by_lane(array))) for name, array in self._arrays().items()},
         }
@@ -173,6 +211,7 @@ class FrameReplay:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Put everything but the frames back; :meth:`load_segment` brings the frames."""
         self._written[:] = state["written"]
+        self._oldest[:] = state["oldest"]
         self.transitions_added = int(state["transitions_added"])
         for name, array in self._arrays().items():
             offset = 0
@@ -199,24 +238,24 @@ class FrameReplay:
         """The segments that cover the frames held now, oldest first in each lane."""
         for lane in range(self.num_lanes):
             written = int(self._written[lane])
-            first = max(0, written - self.slots) // SEGMENT_SLOTS
+            first = int(self._oldest[lane]) // SEGMENT_SLOTS
             for number in range(first, -(-written // SEGMENT_SLOTS)):
                 yield Segment(lane, number, (number + 1) * SEGMENT_SLOTS <= written)
 
     def read_segment(self, segment: Segment) -> npt.NDArray[Any]:
-        """Frames of a segment as far as they are written ``[<= SEGMENT_SLOTS, c, ...]``."""
-        written = int(self._written[segment.lane])
+        """Frames of a segment as far as they are written ``[<= SEGMENT_SLOTS, c, ...]``; zeros where one has left."""
+        written, oldest = int(self._written[segment.lane]), int(self._oldest[segment.lane])
         start = segment.number * SEGMENT_SLOTS
         positions = np.arange(start, min(start + SEGMENT_SLOTS, written))
-        frames: npt.NDArray[Any] = self._frames[self._slot(segment.lane, positions)]
-        return frames
+        return self._frames.read(np.where(positions < oldest, -1, self._slot(segment.lane, positions)))
 
     def load_segment(self, segment: Segment, frames: npt.NDArray[Any]) -> None:
-        """Put the frames of a segment back that are not overwritten by newer ones."""
-        written = int(self._written[segment.lane])
+        """Put the frames of a segment back that are still held; a lane's segments must come in order."""
+        written, oldest = int(self._written[segment.lane]), int(self._oldest[segment.lane])
         positions = segment.number * SEGMENT_SLOTS + np.arange(len(frames))
-        current = (positions >= written - self.slots) & (positions < written)
-        self._frames[self._slot(segment.lane, positions[current])] = frames[current]
+        for position, frame in zip(positions.tolist(), frames, strict=True):
+            if oldest <= position < written:
+                self._frames.write(segment.lane, position % self.slots, frame)
 
     def check_valid(self) -> None:
         """Assert the invariants (tests call it after random operations)."""
@@ -224,7 +263,7 @@ class FrameReplay:
             lane, within = divmod(int(slot), self.slots)
             newest = (int(self._written[lane]) - 1) % self.slots
             behind_newest = (newest - within) % self.slots
-            held = min(int(self._written[lane]), self.slots)
+            held = int(self._written[lane] - self._oldest[lane])
             assert self._actions[slot] >= 0, "a valid slot has an action"
             assert behind_newest >= 1, "a valid slot has a next frame"
             assert behind_newest + int(self._age[slot]) < held, "a valid slot's stack is held"

@@ -18,6 +18,7 @@ from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, LayerHealth, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.memory import GIB, compresses_replay
 from switchmt_snn.learning.replay import FrameReplay
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
@@ -82,7 +83,13 @@ class Training(Stateful):
         learning = config.learning
         self.replays = [
             FrameReplay(
-                learning.replay_capacity_steps, self.num_envs, suite.frame_shape, suite.frame_dtype, suite.frame_stack
+                learning.replay_capacity_steps,
+                self.num_envs,
+                suite.frame_shape,
+                suite.frame_dtype,
+                suite.frame_stack,
+                compresses_replay(config, suite),
+                int(learning.replay_max_gib * GIB / num_tasks),
             )
             for _ in suite.names
         ]

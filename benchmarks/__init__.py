@@ -1,0 +1,1 @@
+"""Speed and size, measured: ``python -m benchmarks.NAME [--json]`` prints a table, or JSON with the environment."""

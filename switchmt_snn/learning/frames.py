@@ -1,0 +1,151 @@
+"""Where a replay memory's frames lie: a plain ring of arrays, or blocks that are compressed without loss.
+
+Both are addressed by flat slots (lane times slots per lane plus slot within the lane; -1 is a frame of zeros), both are
+written slot after slot within a lane, and both give back the same bytes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import zstandard
+
+ZSTD_LEVEL = 3
+_BYTES_OBJECT = 33 + 8
+"""What Python adds to a block: the object's head and the reference to it."""
+
+Slots = npt.NDArray[np.int64]
+Frames = npt.NDArray[Any]
+
+
+class FrameStore(Protocol):
+    """Frames of a ring with ``num_lanes`` lanes."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the frames take now, with everything that is needed to find them."""
+
+    def write(self, lane: int, within: int, frame: Frames) -> None:
+        """Store a lane's next frame; the first slot of a block drops the block that was there."""
+
+    def drop(self, lane: int, within: int) -> None:
+        """Forget the block that holds a slot."""
+
+    def read(self, slots: Slots) -> Frames:
+        """Frames ``[*slots.shape, *frame_shape]``; what was never written or dropped is undefined."""
+
+
+class PlainFrames:
+    """One array for everything; its pages are handed out as they are written."""
+
+    def __init__(self, num_lanes: int, slots: int, frame_shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+        self._slots = slots
+        # One slot more, always zero: the last one, which is slot -1.
+        self._frames = np.zeros((num_lanes * slots + 1, *frame_shape), dtype)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all slots, written or not."""
+        return self._frames.nbytes
+
+    def write(self, lane: int, within: int, frame: Frames) -> None:
+        """Store a frame."""
+        self._frames[lane * self._slots + within] = frame
+
+    def drop(self, lane: int, within: int) -> None:
+        """Nothing to do: an array keeps its size."""
+
+    def read(self, slots: Slots) -> Frames:
+        """Frames ``[*slots.shape, *frame_shape]``."""
+        frames: Frames = self._frames[slots]
+        return frames
+
+
+class CompressedFrames:
+    """Blocks of ``block_slots`` consecutive frames: each frame XOR the one before it, then Zstandard.
+
+    The newest block of a lane is plain until it is full. What does not compress takes the size of the frames.
+    """
+
+    def __init__(
+        self, num_lanes: int, slots: int, frame_shape: tuple[int, ...], dtype: npt.DTypeLike, block_slots: int
+    ) -> None:
+        self._slots, self._shape, self._dtype = slots, frame_shape, np.dtype(dtype)
+        self._block_slots = block_slots
+        self._frame_bytes = int(np.prod(frame_shape)) * self._dtype.itemsize
+        self._blocks_per_lane = -(-slots // self._block_slots)
+        self._blocks: list[bytes | None] = [None] * (num_lanes * self._blocks_per_lane)
+        self._compressed_bytes = 0
+        # Of each lane: the block that is being filled (-1: none) and its frames.
+        self._open = np.full(num_lanes, -1, np.int64)
+        self._open_frames = np.zeros((num_lanes, self._block_slots, self._frame_bytes), np.uint8)
+        self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+        self._decompressor = zstandard.ZstdDecompressor()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the compressed blocks, of Python's objects around them, and of the open blocks."""
+        return self._compressed_bytes + 8 * len(self._blocks) + self._open_frames.nbytes
+
+    def write(self, lane: int, within: int, frame: Frames) -> None:
+        """Store a lane's next frame; compresses its block if that is full."""
+        block, offset = self._block(lane, within), within % self._block_slots
+        if offset == 0:
+            self._store(block, None)
+            self._open[lane] = block
+        self._open_frames[lane, offset] = np.ascontiguousarray(frame, self._dtype).reshape(-1).view(np.uint8)
+        if offset == self._block_slots - 1 or within == self._slots - 1:
+            frames = self._open_frames[lane, : offset + 1]
+            changes = frames.copy()
+            np.bitwise_xor(frames[1:], frames[:-1], out=changes[1:])
+            self._store(block, self._compressor.compress(changes.data))
+            self._open[lane] = -1
+
+    def drop(self, lane: int, within: int) -> None:
+        """Forget the block that holds a slot."""
+        self._store(self._block(lane, within), None)
+
+    def read(self, slots: Slots) -> Frames:
+        """Frames ``[*slots.shape, *frame_shape]``; every block is decompressed once, as far as needed."""
+        flat = slots.reshape(-1)
+        out = np.zeros((len(flat), self._frame_bytes), np.uint8)
+        lanes, within = flat // self._slots, flat % self._slots
+        blocks = np.where(flat < 0, -1, lanes * self._blocks_per_lane + within // self._block_slots)
+        offsets = within % self._block_slots
+        order = np.argsort(blocks, kind="stable")
+        borders = np.flatnonzero(np.diff(blocks[order], prepend=-2, append=-2)).tolist()
+        for start, end in itertools.pairwise(borders):
+            chosen = order[start:end]
+            block = int(blocks[chosen[0]])
+            if block >= 0:
+                frames = self._frames_of(block, int(offsets[chosen].max()) + 1)
+                if frames is not None:
+                    out[chosen] = frames[offsets[chosen]]
+        return out.view(self._dtype).reshape(*slots.shape, *self._shape)
+
+    def _block(self, lane: int, within: int) -> int:
+        return lane * self._blocks_per_lane + within // self._block_slots
+
+    def _store(self, block: int, content: bytes | None) -> None:
+        for stored, sign in ((self._blocks[block], -1), (content, 1)):
+            if stored is not None:
+                self._compressed_bytes += sign * (len(stored) + _BYTES_OBJECT)
+        self._blocks[block] = content
+
+    def _frames_of(self, block: int, count: int) -> npt.NDArray[np.uint8] | None:
+        """The first ``count`` frames of a block as bytes; None if it is not held."""
+        lane = block // self._blocks_per_lane
+        if self._open[lane] == block:
+            still_open: npt.NDArray[np.uint8] = self._open_frames[lane]
+            return still_open
+        content = self._blocks[block]
+        if content is None:
+            return None
+        raw = bytearray(self._decompressor.decompress(content))
+        frames: npt.NDArray[np.uint8] = np.frombuffer(raw, np.uint8).reshape(-1, self._frame_bytes)
+        for index in range(1, count):
+            np.bitwise_xor(frames[index], frames[index - 1], out=frames[index])
+        return frames
