@@ -6,7 +6,6 @@ is reported as not included.
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -21,9 +20,6 @@ from switchmt_snn.export.traffic import Traffic, ann_traffic, traffic
 UNITS_PJ = {"fJ": 1e-3, "pJ": 1.0, "nJ": 1e3}
 EVIDENCE = ("measured", "simulated", "estimated", "reported")
 """``reported``: a number in a survey, without how it was found."""
-DECISIONS_PER_S = 15.0
-"""An Atari agent decides at every fourth of 60 frames per second."""
-
 _TEXTS = ("name", "title", "chip", "process", "source", "includes", "leaves_out")
 _OPERATIONS = ("ac", "ac_conv", "mac", "neuron_update", "spike")
 _MEMORY = ("access_bits", "energy_by_kilobytes", "weight_bits", "state_bits")
@@ -94,18 +90,18 @@ class Energy:
         layers: in forward order: operations, neuron updates and spikes that have a price, and memory traffic where the
             target has a memory model.
         not_included: what was counted and has no price, in words.
-        ann_compute_pj: of the ANN twin; None where the target cannot multiply.
-        quantised_ann_compute_pj: of the quantised twin, bit-serial: one addition per activation bit and weight, if that
-            is cheaper than the target's multiplication.
+        ann_pj: compute and memory of the ANN twin; None where the target cannot multiply.
+        quantised_ann_pj: of the quantised twin: where the ANN's inputs are activations, one addition per activation bit
+            and weight, if that is cheaper than a multiplication, and activations of that many bits in memory.
     """
 
     target: str
     task: str
     layers: tuple[LayerEnergy, ...]
     not_included: tuple[str, ...]
-    ann_compute_pj: float | None
-    ann_memory_pj: float | None
-    quantised_ann_compute_pj: float | None
+    has_memory: bool
+    ann_pj: float | None
+    quantised_ann_pj: float | None
 
     @property
     def compute_pj(self) -> float:
@@ -115,7 +111,7 @@ class Energy:
     @property
     def memory_pj(self) -> float | None:
         """Weight, state and activation traffic; None where the target has no memory model."""
-        return None if self.ann_memory_pj is None else sum(sum(layer.memory_pj.values()) for layer in self.layers)
+        return sum(sum(layer.memory_pj.values()) for layer in self.layers) if self.has_memory else None
 
     @property
     def total_pj(self) -> float:
@@ -124,20 +120,19 @@ class Energy:
 
     @property
     def by_ann(self) -> float | None:
-        """This energy by the ANN twin's; None where the target cannot multiply."""
-        if self.ann_compute_pj is None:
-            return None
-        return self.total_pj / (self.ann_compute_pj + (self.ann_memory_pj or 0.0))
+        """This energy by the ANN twin's; None where the target cannot price all of both."""
+        return self._by(self.ann_pj)
 
     @property
     def by_quantised_ann(self) -> float | None:
-        """This energy by the quantised twin's, whose memory traffic is taken as the ANN twin's."""
-        if self.quantised_ann_compute_pj is None:
-            return None
-        return self.total_pj / (self.quantised_ann_compute_pj + (self.ann_memory_pj or 0.0))
+        """This energy by the quantised twin's; None where the target cannot price all of both."""
+        return self._by(self.quantised_ann_pj)
+
+    def _by(self, twin_pj: float | None) -> float | None:
+        return self.total_pj / twin_pj if twin_pj and not self.not_included else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, with the power at :data:`DECISIONS_PER_S`."""
+        """Plain values."""
         return {
             "target": self.target,
             "task": self.task,
@@ -145,12 +140,10 @@ class Energy:
             "memory_pj": self.memory_pj,
             "total_pj": self.total_pj,
             "not_included": list(self.not_included),
-            "ann_compute_pj": self.ann_compute_pj,
-            "ann_memory_pj": self.ann_memory_pj,
-            "quantised_ann_compute_pj": self.quantised_ann_compute_pj,
+            "ann_pj": self.ann_pj,
+            "quantised_ann_pj": self.quantised_ann_pj,
             "by_ann": self.by_ann,
             "by_quantised_ann": self.by_quantised_ann,
-            "power_uw": self.total_pj * 1e-12 * DECISIONS_PER_S * 1e6,
             "layers": [asdict(layer) | {"total_pj": layer.total_pj} for layer in self.layers],
         }
 
@@ -159,20 +152,35 @@ def estimate(task: TaskProfile, target: Target) -> Energy:
     """Energy of a task's mean decision."""
     unpriced: list[str] = []
     layers = tuple(_layer_energy(layer, task.spiking, target, unpriced) for layer in task.layers)
-    macs, mac = task.dense_macs_of_ann_twin, target.operations_pj.get("mac")
-    bits = math.ceil(math.log2(task.timesteps + 1))
-    ann_memory = None
-    if target.memory is not None:
-        ann_memory = sum(sum(_memory_pj(ann_traffic(layer), layer, target.memory).values()) for layer in task.layers)
     return Energy(
         target=target.name,
         task=task.task,
         layers=layers,
         not_included=tuple(unpriced),
-        ann_compute_pj=None if mac is None else macs * mac,
-        ann_memory_pj=ann_memory,
-        quantised_ann_compute_pj=None if mac is None else macs * min(mac, bits * target.operations_pj["ac"]),
+        has_memory=target.memory is not None,
+        ann_pj=_ann_pj(task, target),
+        quantised_ann_pj=_ann_pj(task, target, quantised=True),
     )
+
+
+def _ann_pj(task: TaskProfile, target: Target, quantised: bool = False) -> float | None:
+    """Energy of the ANN of the same shape, or of its twin with activations of few bits."""
+    mac = target.operations_pj.get("mac")
+    if mac is None:
+        return None
+    total = 0.0
+    for layer in task.layers:
+        # Where numbers come in (the first layer), the quantised twin sees the same numbers.
+        few_bits = quantised and layer.operation == "AC"
+        bits = task.activation_bits
+        price = min(mac, bits * target.operations_pj["ac"]) if few_bits else mac
+        total += layer.macs_of_ann_twin * price
+        if target.memory is not None:
+            parts = _memory_pj(ann_traffic(layer), layer, target.memory)
+            if few_bits:
+                parts["activations"] *= min(1.0, bits / target.memory.state_bits)
+            total += sum(parts.values())
+    return total
 
 
 def _layer_energy(layer: LayerProfile, spiking: bool, target: Target, unpriced: list[str]) -> LayerEnergy:
@@ -223,11 +231,11 @@ def load_target(name_or_file: str) -> Target:
     path = Path(name_or_file)
     if path.suffix in (".yaml", ".yml"):
         try:
-            return read_target(path.read_text(encoding="utf-8"), name_or_file)
-        except OSError as error:
-            raise ConfigError(
-                f"target {name_or_file} cannot be read ({error.strerror}), expected a YAML file"
-            ) from error
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+            raise ConfigError(f"target {name_or_file} cannot be read ({reason}), expected a YAML file") from error
+        return read_target(text, name_or_file)
     known = builtin_targets()
     if name_or_file not in known:
         raise ConfigError(f"unknown target {name_or_file!r}{did_you_mean(name_or_file, known)}")
@@ -248,9 +256,9 @@ def read_target(text: str, where: str) -> Target:
     for key in _TEXTS:
         if not isinstance(raw[key], str) or not raw[key].strip():
             raise ConfigError(f"{where}: {key} is {raw[key]!r}, expected a text; every constant needs its origin")
-    if raw["evidence"] not in EVIDENCE:
+    if not isinstance(raw["evidence"], str) or raw["evidence"] not in EVIDENCE:
         raise ConfigError(f"{where}: evidence is {raw['evidence']!r}, expected one of {', '.join(EVIDENCE)}")
-    if raw["unit"] not in UNITS_PJ:
+    if not isinstance(raw["unit"], str) or raw["unit"] not in UNITS_PJ:
         raise ConfigError(f"{where}: unit is {raw['unit']!r}, expected one of {', '.join(UNITS_PJ)}")
     factor = UNITS_PJ[raw["unit"]]
     _keys(where, "operations.", raw["operations"], ("ac",), _OPERATIONS)
@@ -265,7 +273,7 @@ def read_target(text: str, where: str) -> Target:
             _number(where, "a size", size): _number(where, f"memory of {size} kB", pj) * factor
             for size, pj in levels.items()
         }
-        bits = {k: int(_number(where, f"memory.{k}", raw["memory"][k])) for k in _MEMORY if k.endswith("_bits")}
+        bits = {k: _whole(where, f"memory.{k}", raw["memory"][k]) for k in _MEMORY if k.endswith("_bits")}
         memory = Memory(bits["access_bits"], dict(sorted(priced.items())), bits["weight_bits"], bits["state_bits"])
     texts = {key: raw[key] for key in _TEXTS}
     return Target(**texts, evidence=raw["evidence"], operations_pj=operations, memory=memory)
@@ -284,6 +292,14 @@ def _keys(where: str, prefix: str, raw: Any, needed: tuple[str, ...], allowed: t
 
 
 def _number(where: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
-        raise ConfigError(f"{where}: {key} is {value!r}, expected a number of at least 0")
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not 0 <= value < 1e18:  # NaN is not
+        hint = "; YAML reads 2e-3 as text: write 2.0e-3" if isinstance(value, str) else ""
+        raise ConfigError(f"{where}: {key} is {value!r:.60}, expected a number of at least 0{hint}")
     return float(value)
+
+
+def _whole(where: str, key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 1024:
+        raise ConfigError(f"{where}: {key} is {value!r:.60}, expected a whole number of bits, 1 to 1024")
+    return value

@@ -210,6 +210,11 @@ def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
             f"observations has shape {_shape(observations.shape)}, expected {_shape(('N', *expected))} with N >= 1; "
             "record them with the network of this file"
         )
+    if float(facts["scale"]) < 1 and observations.dtype.kind == "f":
+        raise ExportError(
+            f"observations holds {observations.dtype} values, expected raw integers (the graph scales them by "
+            f"{float(facts['scale']):.4g}); store them as they were seen"
+        )
     encoding, timesteps, scale = str(facts["encoding"]), int(facts["timesteps"]), float(facts["scale"])
     if encoding == "events" and "event_threshold" not in facts:
         raise ExportError("the NIR graph's metadata has no event_threshold, expected it for events; export again")

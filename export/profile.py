@@ -4,7 +4,7 @@ Counted is the network as it is deployed: one task folded in, the head fed with 
 computed once per decision under direct encoding (its input does not change). Definitions: :mod:`export.counting`.
 
 Twins stand beside it: the ANN of the same shape does one multiplication per weight and position (dense), and the
-quantised ANN does the same on activations of log2(T + 1) bits, the number of values that a spike count over T can take.
+quantised ANN does the same on activations of ceil(log2(T + 1)) bits, as many values as a spike count over T can take.
 """
 
 from __future__ import annotations
@@ -120,6 +120,11 @@ class TaskProfile:
         return sum(layer.macs_of_ann_twin for layer in self.layers)
 
     @property
+    def activation_bits(self) -> int:
+        """Bits of the quantised twin's activations: as many values as a spike count over T has."""
+        return math.ceil(math.log2(self.timesteps + 1))
+
+    @property
     def spikes(self) -> float:
         """Mean spikes per decision."""
         return sum(layer.spikes_per_decision for layer in self.layers)
@@ -156,7 +161,7 @@ class TaskProfile:
             "rate": self.rate,
             "twins": {
                 "ann": {"macs": macs},
-                "quantised_ann": {"macs": macs, "activation_bits": math.log2(self.timesteps + 1)},
+                "quantised_ann": {"macs": macs, "activation_bits": self.activation_bits},
             },
             "layers": [layer.to_dict() for layer in self.layers],
         }

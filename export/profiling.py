@@ -6,16 +6,20 @@ import csv
 import io
 import itertools
 import json
+import tempfile
+import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from switchmt_snn.errors import ConfigError, ExportError, did_you_mean
-from switchmt_snn.export.energy import DECISIONS_PER_S, Energy, Target, builtin_targets, estimate, load_target
-from switchmt_snn.export.fit import CHIPS, check_fit, layer_shapes
+from switchmt_snn.errors import ConfigError, ExportError
+from switchmt_snn.export.chips import CHIPS
+from switchmt_snn.export.energy import Energy, Target, builtin_targets, estimate, load_target
+from switchmt_snn.export.fit import check_fit, layer_shapes
 from switchmt_snn.export.fold import fold
 from switchmt_snn.export.nir_profile import profile_nir
 from switchmt_snn.export.precision import effect_of_precision
@@ -29,6 +33,10 @@ from switchmt_snn.learning.files import write_atomically
 from switchmt_snn.learning.run import load_agent
 from switchmt_snn.learning.run_folder import RunFolder, command_line, latest_run
 
+FRAMES_PER_S = 60.0
+"""Of an Atari game; the agent decides at every ``frame_skip``-th."""
+MAX_DECISIONS = 100_000
+"""Observations of one task are held in memory: 28 kB each for an Atari game."""
 SCHEMA = 2
 """Version of ``profile.json`` (docs/energy.md); goes up when a field changes its meaning."""
 
@@ -65,11 +73,21 @@ class Selection:
         known = builtin_targets()
         if not names:
             return cls(tuple(known.values()), tuple(CHIPS))
+        names = tuple(dict.fromkeys(names))
         for name in names:
             if name not in (*known, *CHIPS) and Path(name).suffix not in (".yaml", ".yml"):
-                raise ConfigError(f"unknown target {name!r}{did_you_mean(name, (*known, *CHIPS))}")
-        priced = [name for name in names if name in known or name not in CHIPS]
-        return cls(tuple(load_target(name) for name in priced), tuple(name for name in names if name in CHIPS))
+                raise ConfigError(
+                    f"unknown target {name!r}, expected a YAML file, an energy target ({', '.join(known)}) or a chip "
+                    f"({', '.join(CHIPS)})"
+                )
+        targets = [load_target(name) for name in names if name in known or name not in CHIPS]
+        taken = {target.name for target in targets}
+        if len(taken) < len(targets):
+            raise ConfigError(
+                f"two targets have one name ({', '.join(target.name for target in targets)}), expected different ones; "
+                "change the name in your file"
+            )
+        return cls(tuple(targets), tuple(name for name in names if name in CHIPS))
 
 
 def profile(
@@ -83,7 +101,7 @@ def profile(
 
     Args:
         run: run folder; None takes the newest under ``runs/``.
-        decisions: recorded decisions per task, at least.
+        decisions: recorded decisions per task, rounded up to a multiple of the copies that are recorded.
         checkpoint: ``last`` or ``best``.
         out: where; None takes the run's ``profile/`` folder.
         targets: names of built-in targets or chips, or YAML files; empty takes all built-in ones.
@@ -92,25 +110,30 @@ def profile(
         ConfigError: fewer than one decision, or a target that is not one.
         ExportError: recorded play that cannot be read or does not fit, or a weight that is not finite.
     """
-    if decisions < 1:
-        raise ConfigError(f"decisions is {decisions}, expected at least 1")
+    if not 1 <= decisions <= MAX_DECISIONS:
+        raise ConfigError(f"decisions is {decisions}, expected 1 to {MAX_DECISIONS:,}")
     selection = Selection.of(targets)
     run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     network = fold(agent)  # refuses weights that are not finite before anything is played
+    if not network.spiking:
+        selection = Selection(tuple(t for t in selection.targets if "mac" in t.operations_pj), ())
     folder = _folder(Path(out) if out is not None else run_folder.path / "profile")
     recordings = list(recorded_plays(agent, run_folder.path / "recordings", decisions))
     profiles = tuple(profile_task(agent, k, recording.observations) for k, recording in enumerate(recordings))
     fits = [check_fit(layer_shapes(network), chip).to_dict() for chip in selection.chips]
     bits = sorted({fit["weight_bits"] for fit in fits})
     tasks, frames = [], []
+    rate = agent.config.tasks
+    decisions_per_s = FRAMES_PER_S / rate.frame_skip if rate.suite == "atari" else None
     for index, (recording, counted) in enumerate(zip(recordings, profiles, strict=True)):
         sample = take_sample(agent, index, recording)
         frames.append(sample.frames)
-        episode_decisions = _decisions_per_episode(run_folder.path, agent.step, recording.task)
+        evaluation = _evaluated(run_folder.path, agent.step, recording.task)
         tasks.append(
-            _task_facts(counted, selection.targets, episode_decisions)
+            _task_facts(counted, selection.targets, evaluation, decisions_per_s)
             | {
+                "most_frequent_action_share": float(np.bincount(recording.actions).max() / len(recording.actions)),
                 "gains": _gains(agent, index),
                 "precision": [_precision(agent, index, width, recording) for width in bits],
                 "sample": sample.to_dict(),
@@ -124,6 +147,7 @@ def profile(
         "encoding": settings.encoding,
         "timesteps": settings.timesteps,
         "training_step": agent.step,
+        "decisions_per_s": decisions_per_s,
         "protocol": {r.task: {"epsilon": r.epsilon, "seed": r.seed} for r in recordings},
     }
     return _written(folder, profiles, selection.targets, facts | {"chips": fits}, tasks, tuple(frames))
@@ -145,10 +169,16 @@ def profile_file(
         ExportError: a file that cannot be read or does not fit.
     """
     selection, path = Selection.of(targets), Path(file)
+    if targets and selection.chips:
+        raise ConfigError(
+            f"{', '.join(selection.chips)} is a chip, expected energy targets for a NIR file; chips are checked for "
+            "runs"
+        )
     counted = profile_nir(path, Path(observations))
     folder = _folder(Path(out) if out is not None else path.with_name(f"{path.stem}-profile"))
-    facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps, "chips": []}
-    return _written(folder, (counted,), selection.targets, facts, [_task_facts(counted, selection.targets, None)], ())
+    facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps, "chips": [], "decisions_per_s": None}
+    tasks = [_task_facts(counted, selection.targets, None, None)]
+    return _written(folder, (counted,), selection.targets, facts, tasks, ())
 
 
 def compare_profiles(profiles: Iterable[Profile], out: str | Path | None = None) -> Path:
@@ -168,11 +198,15 @@ def compare_profiles(profiles: Iterable[Profile], out: str | Path | None = None)
 
 
 def _folder(folder: Path) -> Path:
+    """Make a folder, and see that it can be written to before anything is computed."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
     except OSError as error:
-        raise ExportError(f"{folder} cannot be made ({error.strerror}), expected a folder; use --out") from error
-    return folder
+        raise ExportError(
+            f"{folder} cannot be written to ({error.strerror}), expected a folder of yours; use --out"
+        ) from error
 
 
 def _written(
@@ -187,10 +221,11 @@ def _written(
     summary = _summary(profiles, energies)
     facts = {
         "schema": SCHEMA,
-        "headline": _headline(profiles[0].spiking, [energy for _, energy in energies]),
+        "headline": _headline(profiles, [energy for _, energy in energies]),
         "command": command_line(),
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         **facts,
-        "decisions_per_s": DECISIONS_PER_S,
+        "spiking": profiles[0].spiking,
         "summary": summary,
         "targets": {target.name: asdict(target) for target in targets},
         "tasks": tasks,
@@ -201,22 +236,40 @@ def _written(
     return Profile(folder, facts, frames)
 
 
-def _task_facts(task: TaskProfile, targets: tuple[Target, ...], episode_decisions: float | None) -> dict[str, Any]:
+def _task_facts(
+    task: TaskProfile,
+    targets: tuple[Target, ...],
+    evaluation: dict[str, float] | None,
+    decisions_per_s: float | None,
+) -> dict[str, Any]:
     energies = []
     for target in targets:
         energy = estimate(task, target)
-        per_episode = None if episode_decisions is None else energy.total_pj * episode_decisions
-        energies.append(energy.to_dict() | {"per_episode_pj": per_episode})
-    return task.to_dict() | {"decisions_per_episode": episode_decisions, "energy": energies}
+        rates = {
+            "per_episode_pj": None if evaluation is None else energy.total_pj * evaluation["decisions_per_episode"],
+            "power_uw": None if decisions_per_s is None else energy.total_pj * decisions_per_s * 1e-6,
+        }
+        energies.append(energy.to_dict() | rates)
+    return task.to_dict() | {"evaluation": evaluation, "energy": energies}
 
 
-def _decisions_per_episode(run: Path, step: int, task: str) -> float | None:
-    """Mean length of the agent's episodes in the newest evaluation at this training step; None without one."""
+def _evaluated(run: Path, step: int, task: str) -> dict[str, float] | None:
+    """The agent's and the random policy's scores in the newest evaluation at this training step; None without one."""
     found = sorted((run / "evaluations").glob(f"step-{step:012d}_*.json"), key=lambda path: path.stat().st_mtime)
     for path in reversed(found):
-        for row in json.loads(path.read_bytes())["tasks"]:
-            if row["policy"] == "agent" and row["task"] == task:
-                return float(row["mean_length_steps"])
+        try:
+            rows = {row["policy"]: row for row in json.loads(path.read_bytes())["tasks"] if row["task"] == task}
+            if "agent" in rows:
+                return {
+                    "episodes": rows["agent"]["episodes"],
+                    "score": rows["agent"]["mean"],
+                    "random_score": rows["random"]["mean"],
+                    "decisions_per_episode": rows["agent"]["mean_length_steps"],
+                }
+        except (ValueError, KeyError, TypeError) as error:
+            raise ExportError(
+                f"{path} cannot be read ({error!s:.80}), expected an evaluation; delete it, or evaluate again"
+            ) from error
     return None
 
 
@@ -267,22 +320,30 @@ def _range(values: Iterable[float | None]) -> dict[str, float | None]:
     return {"smallest": min(known, default=None), "largest": max(known, default=None)}
 
 
-def _headline(spiking: bool, energies: list[Energy]) -> str:
-    """Whether the network costs less than the ANN of its shape, in one sentence."""
-    if not spiking:
-        return "This is an ANN; its effective counts leave out what a zero activation saves."
+def _headline(tasks: tuple[TaskProfile, ...], energies: list[Energy]) -> str:
+    """Whether the network costs less than the ANN of its shape, after what makes such a number worthless."""
+    dead = [
+        f"{layer.name} in {task.task}"
+        for task in tasks
+        for layer in task.layers
+        if layer.neurons and layer.silent == layer.neurons
+    ]
+    warning = f"No neuron fires in {', '.join(dead)}: Q does not depend on what is seen there. " if dead else ""
+    if not tasks[0].spiking:
+        return warning + "This is an ANN; its effective counts leave out what a zero activation saves."
     compared = [(energy, energy.by_ann) for energy in energies if energy.by_ann is not None]
     if not compared:
-        return "None of these targets can price the ANN twin, so nothing is said about which costs less."
+        return (
+            warning + "None of these targets prices all of the network and its ANN twin: no word on which costs less."
+        )
     worse = [f"{energy.task} on {energy.target}" for energy, ratio in compared if ratio > 1]
     ratios = [ratio for _, ratio in compared]
     span = (
-        f"{min(ratios):.2f} to {max(ratios):.2f} of the ANN of its shape, by task and target (estimates; dense ANN, "
+        f"{min(ratios):.3g} to {max(ratios):.4g} of the ANN of its shape, by task and target (estimates; dense ANN, "
         "weights reused on neither side)"
     )
-    if worse:
-        return f"The spiking network costs MORE than the ANN: {', '.join(worse)}; in all, {span}."
-    return f"The spiking network costs {span}."
+    costs = f"costs MORE than the ANN: {', '.join(worse)}; in all, {span}" if worse else f"costs {span}"
+    return f"{warning}The spiking network {costs}."
 
 
 def _layers_csv(tasks: tuple[TaskProfile, ...]) -> str:

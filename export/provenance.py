@@ -19,10 +19,21 @@ def provenance(run: Path | None = None) -> dict[str, Any]:
 
 
 def _git_commit() -> str:
-    """The commit of this package's source, or ``unknown`` for an installed package."""
+    """The commit of this package's source, ``+changes`` if files differ from it; ``unknown`` for an installed package.
+
+    An installed package may lie within another project's repository, whose commit says nothing.
+    """
     here = Path(__file__).resolve().parent
     try:
-        found = subprocess.run(["git", "-C", here, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
+        if _git(here, "ls-files", "--error-unmatch", Path(__file__).name) is None:
+            return "unknown"
+        commit, changes = _git(here, "rev-parse", "HEAD"), _git(here, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return found.stdout.strip() if found.returncode == 0 else "unknown"
+    return "unknown" if commit is None else commit + ("+changes" if changes else "")
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    """What git answers, or None if it refuses."""
+    answer = subprocess.run(["git", "-C", folder, *words], capture_output=True, text=True, timeout=10)
+    return answer.stdout.strip() if answer.returncode == 0 else None

@@ -7,7 +7,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.activity import all_cores
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.suite import TaskSuite
 
 COPIES = 4
 """Copies of a task that are recorded side by side; each gives a contiguous stretch."""
@@ -60,16 +61,17 @@ def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recor
 
 
 def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Recording:
-    """At least ``decisions`` recorded decisions of a task: read if ``folder`` has them, else played and stored.
+    """``decisions`` recorded decisions of a task, rounded up to whole steps of all copies.
 
-    Played like an evaluation: greedy with the run's evaluation epsilon and seed, up to whole steps of all copies.
+    Read if ``folder`` has as many, else played and stored; the same ones either way. Played like an evaluation: greedy
+    with the run's evaluation epsilon and seed.
     """
     config = agent.config.evaluation
     path = folder / f"{file_name(task)}-step-{agent.step}.npz"
     if path.exists():
-        recording = _read(path, task, agent.suite.observation_shape)
+        recording = _read(path, task, agent.suite)
         if len(recording.actions) >= decisions and recording.seed == config.seed:
-            return recording
+            return _first(recording, decisions)
     recording = play(agent, task, decisions, config.epsilon, config.seed)
     folder.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp.npz")
@@ -84,15 +86,29 @@ def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Reco
     return recording
 
 
-def _read(path: Path, task: str, shape: tuple[int, ...]) -> Recording:
+def _first(recording: Recording, decisions: int) -> Recording:
+    """The first decisions of every copy: what a recording of that many would have been."""
+    steps = -(-decisions // COPIES)
+    observations, actions = (
+        values.reshape(COPIES, -1, *values.shape[1:])[:, :steps].reshape(-1, *values.shape[1:])
+        for values in (recording.observations, recording.actions)
+    )
+    return replace(recording, observations=np.ascontiguousarray(observations), actions=actions)
+
+
+def _read(path: Path, task: str, suite: TaskSuite) -> Recording:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             observations, actions = stored["observations"], stored["actions"]
             recording = Recording(task, observations, actions, float(stored["epsilon"]), int(stored["seed"]))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ExportError(f"recorded play {path} cannot be read ({error}), expected an .npz file; delete it") from error
-    if observations.shape[1:] != shape:
-        raise ExportError(f"recorded play {path} has shape {observations.shape[1:]}, expected {shape}; delete it")
+    expected = (len(actions), *suite.observation_shape)
+    if observations.shape != expected or observations.dtype != suite.frame_dtype or len(actions) % COPIES:
+        raise ExportError(
+            f"recorded play {path} has shape {observations.shape} of {observations.dtype} for {len(actions)} actions, "
+            f"expected {expected} of {np.dtype(suite.frame_dtype)}; delete it"
+        )
     return recording
 
 

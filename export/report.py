@@ -70,6 +70,11 @@ def millijoule(value_pj: float) -> str:
     return digits(value_pj / 1e9)
 
 
+def thousandth(value: float) -> str:
+    """A unit as the next larger one."""
+    return digits(value / 1e3)
+
+
 def percent(value: float) -> str:
     """A share."""
     return f"{value:.2%}" if value < 1 else "100%"
@@ -80,7 +85,7 @@ def two(value: float) -> str:
     return f"{value:.2f}"
 
 
-FILTERS = {filter.__name__: filter for filter in (whole, digits, microjoule, millijoule, percent, two)}
+FILTERS = {filter.__name__: filter for filter in (whole, digits, microjoule, millijoule, thousandth, percent, two)}
 
 
 def _raster(layer: dict[str, Any], timesteps: int) -> str:

@@ -94,7 +94,7 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class ProfileOptions:
-    """Count what a run's network does while it plays, in exact integers, and estimate its energy."""
+    """profile [RUN ...] or profile FILE.nir: count what a network does while it plays, and estimate its energy."""
 
     decisions: int = 1000
     """Recorded decisions per task."""
@@ -308,6 +308,8 @@ def _profile(argv: list[str]) -> int:
             "a NIR file and --observations belong together, expected switchmt-snn profile FILE.nir --observations "
             "FILE.npz; a run has recorded observations of its own"
         )
+    if files and (options.decisions, options.checkpoint) != (ProfileOptions.decisions, ProfileOptions.checkpoint):
+        raise ConfigError("--decisions and --checkpoint are for runs, expected neither with a NIR file; leave them out")
     profiles: list[Profile] = []
     # With several, --out is the comparison's; each one's own files lie in its own folder.
     out = options.out if len(names) < 2 else None
@@ -332,10 +334,12 @@ def _profile(argv: list[str]) -> int:
 def _print_profiles(profiles: list[dict[str, Any]]) -> None:
     from switchmt_snn.viewing.tables import comparison_table, energy_table, fit_table, profile_table
 
-    console = Console()
+    console = Console(markup=False)  # names may hold brackets
     if len(profiles) > 1:
         console.print(comparison_table(profiles))
     for facts in profiles:
+        if len(profiles) > 1:
+            console.rule(facts["run"], align="left", characters="-")
         console.print(facts["headline"], soft_wrap=True)
         for task in facts["tasks"]:
             console.print(profile_table(task))

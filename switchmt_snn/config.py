@@ -206,6 +206,9 @@ class LearningConfig:
     """Clamp each gradient element, or scale the whole gradient to a largest norm."""
     gradient_clip_at: float = 1.0
     """The bound of gradient_clip."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
+    has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere."""
     clip_rewards: bool = True
     """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576

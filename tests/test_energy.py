@@ -63,11 +63,12 @@ def test_by_hand() -> None:
     energy = estimate(TASK, read_target(make(), "t"))
     assert energy.compute_pj == pytest.approx(400 + 48 + 72)
     assert (energy.memory_pj, energy.not_included) == (None, ())
-    assert energy.ann_compute_pj == pytest.approx(860)
+    assert energy.ann_pj == pytest.approx(860)
     assert energy.by_ann == pytest.approx(520 / 860)
-    # log2(2 + 1) = 1.58: two additions per weight are cheaper than a multiplication of 10.
-    assert energy.quantised_ann_compute_pj == pytest.approx(86 * 4)
-    assert energy.to_dict()["power_uw"] == pytest.approx(520e-12 * 15 * 1e6)
+    # Spike counts of 0, 1, 2 need two bits: two additions of 2 pJ are cheaper than a multiplication of 10, but for the
+    # first layer, which sees numbers.
+    assert energy.quantised_ann_pj == pytest.approx(50 * 10 + 36 * 4)
+    assert energy.by_quantised_ann == pytest.approx(520 / 644)
 
 
 def test_what_has_no_price_is_named_and_not_guessed() -> None:
@@ -79,6 +80,13 @@ def test_what_has_no_price_is_named_and_not_guessed() -> None:
         "8 neuron updates of hidden",
     )
     assert energy.by_ann is None
+
+
+def test_a_part_of_the_network_is_not_compared_with_the_whole_twin() -> None:
+    energy = estimate(TASK, read_target(make(operations={"ac": 2.0, "mac": 10.0}), "t"))
+    assert len(energy.not_included) == 2, "neuron updates have no price"
+    assert energy.ann_pj == pytest.approx(860)
+    assert (energy.by_ann, energy.by_quantised_ann) == (None, None)
 
 
 def test_memory_is_read_for_every_operation() -> None:
@@ -107,7 +115,11 @@ def test_memory_is_read_for_every_operation() -> None:
     assert energy.memory_pj == pytest.approx(sum(sum(layer.memory_pj.values()) for layer in energy.layers))
     # The ANN: a convolution reads an input per multiplication, a linear layer each of its 5 once.
     reads, written, biases = 50 + 5 + 5, 8 + 4 + 2, 8 + 4 + 2
-    assert energy.ann_memory_pj == pytest.approx((reads + written) * state + (86 + biases) * weight)
+    memory = (reads + written) * state + (86 + biases) * weight
+    assert energy.ann_pj == pytest.approx(860 + memory)
+    # Activations of two bits instead of 16 in the hidden layer and the head.
+    saved = (5 + 4 + 5 + 2) * state * (1 - 2 / 16)
+    assert energy.quantised_ann_pj == pytest.approx(644 + memory - saved)
 
 
 def test_built_in_targets_have_origin_and_price() -> None:
@@ -117,7 +129,8 @@ def test_built_in_targets_have_origin_and_price() -> None:
     for name, target in targets.items():
         assert name == target.name
         assert any(word in target.source for word in ("doi", "arXiv", "PMC"))
-        assert all(math.isfinite(price) and price > 0 for price in target.operations_pj.values())
+        assert all(math.isfinite(price) and price >= 0 for price in target.operations_pj.values())
+        assert target.operations_pj["ac"] > 0
         by_chip[target.chip] = by_chip.get(target.chip, 0) + 1
     assert by_chip["Loihi"] > 1, "several sources for one chip give a range"
     assert targets["spinnaker-system"].operations_pj["ac"] == pytest.approx(13_300)
@@ -135,6 +148,17 @@ def test_built_in_targets_have_origin_and_price() -> None:
         ({"evidence": "hearsay"}, "evidence is 'hearsay'"),
         ({"volts": 1}, "unknown key volts"),
         ({"memory": {"access_bits": 64}}, "has no memory.energy_by_kilobytes"),
+        ({"unit": ["pJ"]}, "unit is ['pJ']"),
+        ({"operations": {"ac": 10**400}}, "operations.ac is 1000"),
+        ({"operations": {"ac": "2e-3"}}, "YAML reads 2e-3 as text: write 2.0e-3"),
+        (
+            {"memory": {"access_bits": 0, "energy_by_kilobytes": {8: 1}, "weight_bits": 8, "state_bits": 8}},
+            "memory.access_bits is 0, expected a whole number of bits",
+        ),
+        (
+            {"memory": {"access_bits": 64, "energy_by_kilobytes": {8: 1}, "weight_bits": 8.7, "state_bits": 8}},
+            "memory.weight_bits is 8.7, expected a whole number of bits",
+        ),
     ],
 )
 def test_wrong_targets_are_refused_in_one_line(changes: dict, message: str) -> None:
@@ -144,7 +168,7 @@ def test_wrong_targets_are_refused_in_one_line(changes: dict, message: str) -> N
     assert "\n" not in str(error.value)
 
 
-def test_a_missing_source_and_text_that_is_no_target() -> None:
+def test_a_missing_source_and_text_that_is_no_target(tmp_path: Path) -> None:
     without = {key: value for key, value in TARGET.items() if key != "source"}
     for text, message in ((yaml.safe_dump(without), "has no source"), ("[1, 2", "is not YAML"), ("7", "expected keys")):
         with pytest.raises(ConfigError, match=message):
@@ -153,6 +177,9 @@ def test_a_missing_source_and_text_that_is_no_target() -> None:
         load_target("loihi-2081")
     with pytest.raises(ConfigError, match="cannot be read"):
         load_target("nowhere.yaml")
+    (tmp_path / "latin.yaml").write_bytes("title: 1 \u00b5J".encode("latin-1"))
+    with pytest.raises(ConfigError, match="not UTF-8 text"):
+        load_target(str(tmp_path / "latin.yaml"))
 
 
 def test_a_target_of_ones_own(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
@@ -163,7 +190,10 @@ def test_a_target_of_ones_own(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert "my-chip" in out
     assert "loihi-2018" in out
     assert "cmos45-fp32" not in out
-    assert out.startswith("The spiking network costs")
+    assert "The spiking network costs" in out
+    (tmp_path / "twin.yaml").write_text(make(name="loihi-2018"))
+    _, err = call(capsys, "profile", run, "--target", tmp_path / "twin.yaml", "--target", "loihi-2018", code=2)
+    assert "two targets have one name" in err
     (tmp_path / "chip.yaml").write_text(make(unit="eV"))
     _, err = call(capsys, "profile", run, "--target", tmp_path / "chip.yaml", code=2)
     assert "unit is 'eV'" in err

@@ -106,3 +106,21 @@ def test_a_loss_that_is_not_finite_is_seen() -> None:
     assert part.is_finite()
     part.update(batch(float("nan")), 0)
     assert not part.is_finite()
+
+
+def test_bfloat16_rounds_the_products_of_an_update_and_nothing_else() -> None:
+    """Gradients point the same way, weights and Adam's moments stay float32, acting is bitwise the same."""
+    exact, rounded = learner(), learner(precision="bfloat16")
+    observations = batch().observations
+    assert np.array_equal(exact.act(observations, 0), rounded.act(observations, 0))
+    gradients = []
+    for one in (exact, rounded):
+        one.update(batch(), 0)
+        gradients.append(torch.cat([p.grad.reshape(-1) for p in one.network.parameters()]))
+    assert not torch.equal(*gradients)
+    assert torch.cosine_similarity(*gradients, dim=0) > 0.99
+    assert {p.dtype for p in rounded.network.parameters()} == {torch.float32}
+    assert {v.dtype for s in rounded.optimizer.state.values() for v in s.values()} == {torch.float32}
+    x = torch.from_numpy(observations)
+    rounded.network.load_state_dict(exact.network.state_dict())
+    assert torch.equal(exact.network.eval()(x, 0), rounded.network.eval()(x, 0))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from torch import nn
 
 from switchmt_snn.config import METHOD_TRAITS
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export import profile
+from switchmt_snn.export import profile, provenance
 from switchmt_snn.export.fold import fold
 from switchmt_snn.export.precision import at_precision, effect_of_precision
 from switchmt_snn.export.profile import profile_task
@@ -134,7 +136,7 @@ def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, _ = call(capsys, "profile", run, "--decisions", 50, "--json")
     assert json.loads(out) == facts
     _, err = call(capsys, "profile", run, "--decisions", 0, code=2)
-    assert "decisions is 0, expected at least 1" in err
+    assert "decisions is 0, expected 1 to 100,000" in err
 
 
 def test_chips_and_targets_are_chosen_by_name(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
@@ -145,7 +147,8 @@ def test_chips_and_targets_are_chosen_by_name(run: Path, capsys: pytest.CaptureF
     assert facts["chips"][0]["fits"], "16 hidden units of a MinAtar network"
     assert facts["tasks"][0]["precision"][0]["bits"] == 8
     _, err = call(capsys, "profile", run, "--target", "spekc", code=2)
-    assert "unknown target 'spekc'; did you mean 'speck'" in err
+    assert "unknown target 'spekc', expected a YAML file" in err
+    assert "xylo-audio-3" in err, "all of them"
 
 
 def test_energy_per_episode_needs_an_evaluation_at_this_step(run: Path) -> None:  # noqa: F811
@@ -156,11 +159,67 @@ def test_energy_per_episode_needs_an_evaluation_at_this_step(run: Path) -> None:
         if (row["policy"], row["task"]) == ("agent", "breakout")
     ]
     task = profile(run, decisions=20).facts["tasks"][0]
-    assert task["decisions_per_episode"] == row["mean_length_steps"]
+    assert task["evaluation"]["decisions_per_episode"] == row["mean_length_steps"]
+    assert task["evaluation"]["score"] == row["mean"]
     assert task["energy"][0]["per_episode_pj"] == task["energy"][0]["total_pj"] * row["mean_length_steps"]
+    assert task["energy"][0]["power_uw"] is None, "MinAtar has no frames per second"
+    for path in (run / "evaluations").glob("*.json"):
+        path.write_text("{}")
+    with pytest.raises(ExportError, match="expected an evaluation; delete it"):
+        profile(run, decisions=20)
     shutil.rmtree(run / "evaluations")
     task = profile(run, decisions=20).facts["tasks"][0]
-    assert (task["decisions_per_episode"], task["energy"][0]["per_episode_pj"]) == (None, None)
+    assert (task["evaluation"], task["energy"][0]["per_episode_pj"]) == (None, None)
+
+
+def test_decisions_are_the_same_from_a_longer_recording(run: Path) -> None:  # noqa: F811
+    def counts(decisions: int) -> list:
+        return [task["layers"] for task in profile(run, decisions=decisions).facts["tasks"]]
+
+    first = counts(60)
+    counts(120)
+    assert counts(60) == first
+    shutil.rmtree(run / "recordings")
+    assert counts(60) == first
+
+
+def test_a_network_without_a_voice_and_an_ann_say_so(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    agent = load_agent(run, "last", "cpu")
+    with torch.no_grad():
+        for stream in agent.network.streams.values():
+            stream.neurons.leaky.threshold.fill_(1e6)
+    monkeypatch.setattr("switchmt_snn.export.profiling.load_agent", lambda *_: agent)
+    facts = profile(run, decisions=20).facts
+    assert facts["headline"].startswith("No neuron fires in hidden in breakout, hidden in asterix: Q does not depend")
+    ann = make_agent(method="DQN_D", tasks={"names": ["breakout", "asterix"]})
+    monkeypatch.setattr("switchmt_snn.export.profiling.load_agent", lambda *_: ann)
+    facts = profile(run, decisions=20).facts
+    assert facts["headline"].startswith("This is an ANN")
+    assert facts["chips"] == []
+    assert set(facts["targets"]) == {"cmos45-fp32", "cmos45-int8"}, "only those that multiply"
+
+
+def test_an_out_that_cannot_be_written_to_is_refused_first(
+    run: Path,  # noqa: F811
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "file").write_text("")
+    _, err = call(capsys, "profile", run, "--out", tmp_path / "file" / "inside", code=2)
+    assert "cannot be written to" in err
+    assert not (run / "recordings").exists()
+
+
+def test_the_commit_is_that_of_this_package_only(tmp_path: Path) -> None:
+    shutil.copy(provenance.__file__, tmp_path / "provenance.py")
+    for words in (
+        ("init", "-q"),
+        ("-c", "user.name=x", "-c", "user.email=x", "commit", "-q", "--allow-empty", "-m", "x"),
+    ):
+        subprocess.run(["git", "-C", tmp_path, *words], check=True)
+    code = "import provenance; print(provenance.provenance()['git_commit'])"
+    answer = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "unknown"
 
 
 def test_rounded_weights_are_those_of_a_layers_own_step() -> None:

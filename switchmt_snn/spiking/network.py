@@ -63,6 +63,17 @@ class ObservationSpec:
     num_tasks: int
 
 
+def synaptic_products(synapses: nn.Module, x: Tensor, precision: torch.dtype | None) -> Tensor:
+    """``W x + b`` with weights and inputs rounded to a dtype (spikes stay exact); None rounds nothing.
+
+    What comes after (normalisation, gain, membranes, head) is in the dtype of ``x``.
+    """
+    if precision is None:
+        return cast(Tensor, synapses(x))
+    with torch.autocast(x.device.type, precision):
+        return cast(Tensor, synapses(x)).to(x.dtype)
+
+
 class TrunkLayer(nn.Module):
     """Convolution (or linear map), BatchNorm, neurons."""
 
@@ -72,9 +83,9 @@ class TrunkLayer(nn.Module):
         self.normalization = normalization
         self.neurons = neurons
 
-    def current(self, x: Tensor, task: int) -> Tensor:
+    def current(self, x: Tensor, task: int, precision: torch.dtype | None = None) -> Tensor:
         """Input currents ``[T, B, ...]`` of the neurons for inputs ``[T, B, ...]``, time folded into the batch."""
-        y = self.synapses(x.flatten(0, 1))
+        y = synaptic_products(self.synapses, x.flatten(0, 1), precision)
         if self.normalization is not None:
             y = self.normalization(y, task)
         return cast(Tensor, y.unflatten(0, x.shape[:2]))
@@ -93,9 +104,9 @@ class Stream(nn.Module):
         self.neurons = make_neuron_layer(config, spiking)
         self.head = nn.Linear(hidden, num_outputs)
 
-    def current(self, x_TBN: Tensor, task: int) -> Tensor:
+    def current(self, x_TBN: Tensor, task: int, precision: torch.dtype | None = None) -> Tensor:
         """Gated input currents ``[T, B, N]`` of the hidden neurons: Eq. 1's ``f(sum_i s_i, max_j d_j^T c)``."""
-        current_TBN = cast(Tensor, self.synapses(x_TBN))
+        current_TBN = synaptic_products(self.synapses, x_TBN, precision)
         if self.dendrites is not None:
             current_TBN = current_TBN * self.dendrites(task)
         if self.k_winners is not None:
@@ -169,6 +180,7 @@ class QNetwork(nn.Module):
         state: State | None = None,
         activity: dict[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
+        precision: torch.dtype | None = None,
     ) -> Tensor:
         """Q-values of a batch of observations of one task.
 
@@ -179,6 +191,7 @@ class QNetwork(nn.Module):
                 dict starts from rest and, if None, keeps nothing.
             activity: if given, filled with each neuron layer's spikes (or activations) ``[T, B, ...]`` by name.
             generator: source of random numbers of the ``rate`` encoding.
+            precision: dtype of all synaptic products but the head's (:func:`synaptic_products`).
 
         Returns:
             ``[B, A]`` float Q-values.
@@ -186,11 +199,11 @@ class QNetwork(nn.Module):
         state = {} if state is None else state
         x = self.encoder(observation.to(torch.float32) * self.observation.scale, generator)
         for name, layer in self.trunk.items():
-            current = self._over_time(cast(TrunkLayer, layer).current(x, task))
+            current = self._over_time(cast(TrunkLayer, layer).current(x, task, precision))
             x = self._fire(name, cast(TrunkLayer, layer), current, state, activity)
         features_TBN = x.flatten(2)
         outputs = {
-            name: self._readout(name, cast(Stream, stream), features_TBN, task, state, activity)
+            name: self._readout(name, cast(Stream, stream), features_TBN, task, state, activity, precision)
             for name, stream in self.streams.items()
         }
         return self._combine(outputs)
@@ -222,9 +235,10 @@ class QNetwork(nn.Module):
         task: int,
         state: State,
         activity: dict[str, Tensor] | None,
+        precision: torch.dtype | None,
     ) -> Tensor:
         """The stream's output: ``[B, outputs]`` (mean, last_membrane) or ``[T, B, outputs]`` (max_membrane)."""
-        spikes_TBN = self._fire(name, stream, stream.current(features_TBN, task), state, activity)
+        spikes_TBN = self._fire(name, stream, stream.current(features_TBN, task, precision), state, activity)
         if self.config.readout == "mean":
             return cast(Tensor, stream.head(spikes_TBN.mean(0)))
         outputs_t = stream.head(spikes_TBN)

@@ -131,9 +131,9 @@ def energy_table(profile: dict[str, Any]) -> Table:
     table = _table(
         "Energy per decision in µJ: compute, and memory where the target has a memory model",
         "x ANN: by the ANN of the same shape on the same target, the task with the most; x QANN: by the same with "
-        "activations of log2(T + 1) bits; above 1 the spiking network costs more. * something counted has no price "
-        "there (see not_included in profile.json; usually the first layer's multiplications). Constants, sources and "
-        "what they leave out: profile.json. How: est(imated), sim(ulated), rep(orted in a survey), mea(sured).",
+        "activations of few bits; above 1 the spiking network costs more. * something counted has no price there "
+        "(report.html says what, and what each target leaves out). How: est(imated), sim(ulated), rep(orted), "
+        "mea(sured).",
     )
     _add_columns(table, ("target", "how"), (*(task["task"] for task in tasks), "x ANN", "x QANN"))
     for index, target in enumerate(profile["targets"].values()):
