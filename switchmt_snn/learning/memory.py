@@ -20,7 +20,7 @@ PROCESS_BYTES = 700 * 1024**2
 """Python, torch, its kernels' scratch and the emulators (measured: 0.42 GiB before emulators and replay)."""
 
 COMPRESSION = 10
-"""By how much compressed frames are smaller, for the estimate (measured on Atari: 15 to 270 times)."""
+"""By how much compressed frames are smaller, for the estimate (measured: 15 to 137 times, docs/performance.md)."""
 
 
 @dataclass(frozen=True)
