@@ -338,7 +338,7 @@ def performance_page() -> str:
         f"`python -m benchmarks.replay --steps {replays[0]['steps_per_game']} [--run RUN]`. Frames are kept once, in "
         "blocks of 16,",
         "each XOR the one before it, then Zstandard (`switchmt_snn/learning/frames.py`); the samples are bitwise those",
-        "of the plain ring. Bytes count everything: frames, actions, rewards, flags, Python's objects, the open blocks.",
+        "of the plain ring. Bytes count everything: frames, actions, rewards, flags, Python's objects, open blocks.",
         "",
         "| policy | game | compressed B | plain B | add | of an environment step | sample 32 | of its update "
         "| sample 512 | of its update |",

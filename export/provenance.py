@@ -27,7 +27,8 @@ def _git_commit() -> str:
     try:
         if _git(here, "ls-files", "--error-unmatch", Path(__file__).name) is None:
             return "unknown"
-        commit, changes = _git(here, "rev-parse", "HEAD"), _git(here, "status", "--porcelain", "--untracked-files=no")
+        commit = _git(here, "rev-parse", "HEAD")
+        changes = _git(here, "status", "--porcelain", "--untracked-files=no", "--", ":/export", ":/switchmt_snn")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return "unknown" if commit is None else commit + ("+changes" if changes else "")
