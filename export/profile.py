@@ -167,41 +167,63 @@ class TaskProfile:
         }
 
 
-def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> TaskProfile:
-    """Count one task's recorded decisions; memory does not grow with their number.
+class TaskCounter:
+    """Counts one task's decisions as they come; its memory does not grow with their number."""
 
-    Args:
-        agent: the trained network.
-        task: task index.
-        observations: raw observations ``[N, *shape]``.
+    def __init__(self, agent: Agent, task: int) -> None:
+        """Start at nothing; ``task`` is a task's index."""
+        self.agent, self.task, self.network = agent, task, fold(agent)
+        self._synapses = [SynapseCounter(_synapses(self.network, layer, task)) for layer in self.network.layers]
+        self._steps = agent.config.network.timesteps
+        self._neurons = [
+            NeuronCounter(layer.name, layer.output_shape, self._steps) for layer in self.network.hidden_layers
+        ]
+        self._chunks = 0
+
+    def add(self, observations: npt.NDArray[Any]) -> None:
+        """Count raw observations ``[N, *shape]``.
+
+        Raises:
+            ExportError: none, or observations of another shape.
+        """
+        expected = self.agent.suite.observation_shape
+        if len(observations) == 0 or observations.shape[1:] != expected:
+            raise ExportError(
+                f"the recorded observations have shape {observations.shape}, expected "
+                f"(N, {', '.join(map(str, expected))}) with N >= 1; record them again"
+            )
+        once = self.agent.config.network.encoding == "direct"
+        for chunk in chunks(observations):
+            # Each chunk has random numbers of its own, for random encodings.
+            encoded_TB = encode(self.agent.suite, self.agent.config, chunk, self._chunks)
+            active = active_neurons(self.agent, chunk, self.task, self._chunks).by_layer
+            inputs = [encoded_TB[:1] != 0 if once else encoded_TB != 0, *active.values()]
+            for counter, fed in zip(self._synapses, inputs, strict=True):
+                counter.add(fed)
+            for neuron_counter, fired in zip(self._neurons, active.values(), strict=True):
+                neuron_counter.add(fired)
+            self._chunks += 1
+
+    def profile(self) -> TaskProfile:
+        """What has been counted."""
+        neurons: list[NeuronCounter | None] = [*self._neurons, None]
+        layers = tuple(
+            _layer_profile(self.network, *parts)
+            for parts in zip(self.network.layers, self._synapses, neurons, strict=True)
+        )
+        name, decisions = self.agent.suite.names[self.task], self._synapses[0].decisions
+        return TaskProfile(name, decisions, self._steps, self.network.spiking, layers)
+
+
+def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> TaskProfile:
+    """Count one task's decisions on raw observations ``[N, *shape]``; ``task`` is its index.
 
     Raises:
         ExportError: no decisions, or observations of another shape.
     """
-    expected = agent.suite.observation_shape
-    if len(observations) == 0 or observations.shape[1:] != expected:
-        raise ExportError(
-            f"the recorded observations have shape {observations.shape}, expected (N, {', '.join(map(str, expected))}) "
-            "with N >= 1; record them again"
-        )
-    network = fold(agent)
-    settings = agent.config.network
-    synapses = [SynapseCounter(_synapses(network, layer, task)) for layer in network.layers]
-    steps = settings.timesteps
-    neurons = [NeuronCounter(layer.name, layer.output_shape, steps) for layer in network.hidden_layers]
-    for seed, chunk in enumerate(chunks(observations)):
-        encoded_TB = encode(agent.suite, agent.config, chunk, seed)
-        once = settings.encoding == "direct"
-        active = active_neurons(agent, chunk, task, seed).by_layer
-        inputs = [encoded_TB[:1] != 0 if once else encoded_TB != 0, *active.values()]
-        for counter, fed in zip(synapses, inputs, strict=True):
-            counter.add(fed)
-        for neuron_counter, fired in zip(neurons, active.values(), strict=True):
-            neuron_counter.add(fired)
-    layers = []
-    for index, (layer, counter) in enumerate(zip(network.layers, synapses, strict=True)):
-        layers.append(_layer_profile(network, layer, counter, neurons[index] if index < len(neurons) else None))
-    return TaskProfile(agent.suite.names[task], len(observations), steps, network.spiking, tuple(layers))
+    counter = TaskCounter(agent, task)
+    counter.add(observations)
+    return counter.profile()
 
 
 def _synapses(network: FoldedNetwork, layer: Layer, task: int) -> Synapses:

@@ -23,9 +23,9 @@ from switchmt_snn.export.fit import check_fit, layer_shapes
 from switchmt_snn.export.fold import fold
 from switchmt_snn.export.nir_profile import profile_nir
 from switchmt_snn.export.precision import effect_of_precision
-from switchmt_snn.export.profile import TaskProfile, profile_task
+from switchmt_snn.export.profile import TaskCounter, TaskProfile
 from switchmt_snn.export.provenance import provenance
-from switchmt_snn.export.recording import Recording, recorded_plays
+from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report import Frames, render_report
 from switchmt_snn.export.sample import take_sample
 from switchmt_snn.learning.agent import Agent
@@ -35,8 +35,9 @@ from switchmt_snn.learning.run_folder import RunFolder, command_line, latest_run
 
 FRAMES_PER_S = 60.0
 """Of an Atari game; the agent decides at every ``frame_skip``-th."""
-MAX_DECISIONS = 100_000
-"""Observations of one task are held in memory: 28 kB each for an Atari game."""
+MAX_DECISIONS = 10**7
+KEPT_DECISIONS = 4000
+"""Recorded decisions per task that are held and stored; of more, counts are made while they are played."""
 SCHEMA = 2
 """Version of ``profile.json`` (docs/energy.md); goes up when a field changes its meaning."""
 
@@ -119,8 +120,8 @@ def profile(
     if not network.spiking:
         selection = Selection(tuple(t for t in selection.targets if "mac" in t.operations_pj), ())
     folder = _folder(Path(out) if out is not None else run_folder.path / "profile")
-    recordings = list(recorded_plays(agent, run_folder.path / "recordings", decisions))
-    profiles = tuple(profile_task(agent, k, recording.observations) for k, recording in enumerate(recordings))
+    recordings = list(recorded_plays(agent, run_folder.path / "recordings", min(decisions, KEPT_DECISIONS)))
+    profiles = tuple(_counted(agent, k, recording, decisions) for k, recording in enumerate(recordings))
     fits = [check_fit(layer_shapes(network), chip).to_dict() for chip in selection.chips]
     bits = sorted({fit["weight_bits"] for fit in fits})
     tasks, frames = [], []
@@ -251,6 +252,17 @@ def _task_facts(
         }
         energies.append(energy.to_dict() | rates)
     return task.to_dict() | {"evaluation": evaluation, "energy": energies}
+
+
+def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> TaskProfile:
+    """Counts on the recording, or on play that begins like it and is not kept."""
+    counter = TaskCounter(agent, task)
+    if decisions <= KEPT_DECISIONS:
+        counter.add(recording.observations)
+    else:
+        for piece, _ in play_in_pieces(agent, recording.task, decisions, recording.epsilon, recording.seed):
+            counter.add(piece.reshape(-1, *agent.suite.observation_shape))
+    return counter.profile()
 
 
 def _evaluated(run: Path, step: int, task: str) -> dict[str, float] | None:

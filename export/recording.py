@@ -22,6 +22,8 @@ from switchmt_snn.tasks.suite import TaskSuite
 
 COPIES = 4
 """Copies of a task that are recorded side by side; each gives a contiguous stretch."""
+PIECE_STEPS = 64
+"""Steps of every copy that are held at once where play is not kept."""
 
 
 @dataclass(frozen=True)
@@ -114,27 +116,38 @@ def _read(path: Path, task: str, suite: TaskSuite) -> Recording:
 
 def play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> Recording:
     """Play at least ``decisions`` decisions of a task in :data:`COPIES` copies."""
+    pieces = list(play_in_pieces(agent, task, decisions, epsilon, seed))
+    observations, actions = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    flat = observations.reshape(-1, *agent.suite.observation_shape)
+    return Recording(task, flat, actions.reshape(-1), epsilon, seed)
+
+
+def play_in_pieces(
+    agent: Agent, task: str, decisions: int, epsilon: float, seed: int
+) -> Iterator[tuple[npt.NDArray[Any], npt.NDArray[np.int64]]]:
+    """:func:`play` step by step: observations ``[COPIES, n, *shape]`` and actions ``[COPIES, n]``, n a few steps."""
     index, suite = agent.suite.index(task), agent.suite
-    steps = -(-decisions // COPIES)
     rng = np.random.default_rng([seed, index])
     valid = np.flatnonzero(suite.valid_actions_KA[index])
     agent.reseed(seed)
     copies = Play(suite, index, COPIES)
-    observations = np.empty((COPIES, steps, *suite.observation_shape), suite.frame_dtype)
-    actions = np.empty((COPIES, steps), np.int64)
-    episodes = 0
+    episodes, left = 0, -(-decisions // COPIES)
     try:
-        for step in range(steps):
-            over = np.flatnonzero(copies.over)
-            if len(over):
-                copies.begin(over, np.asarray([episode_seed(seed, index, episodes + i) for i in range(len(over))]))
-                episodes += len(over)
-            explore = rng.random(COPIES) < epsilon
-            random_actions = valid[rng.integers(0, len(valid), COPIES)]
-            observations[:, step] = copies.observations
-            actions[:, step] = np.where(explore, random_actions, agent.act(copies.observations, index))
-            copies.step(actions[:, step])
+        while left:
+            steps = min(left, PIECE_STEPS)
+            observations = np.empty((COPIES, steps, *suite.observation_shape), suite.frame_dtype)
+            actions = np.empty((COPIES, steps), np.int64)
+            for step in range(steps):
+                over = np.flatnonzero(copies.over)
+                if len(over):
+                    copies.begin(over, np.asarray([episode_seed(seed, index, episodes + i) for i in range(len(over))]))
+                    episodes += len(over)
+                explore = rng.random(COPIES) < epsilon
+                random_actions = valid[rng.integers(0, len(valid), COPIES)]
+                observations[:, step] = copies.observations
+                actions[:, step] = np.where(explore, random_actions, agent.act(copies.observations, index))
+                copies.step(actions[:, step])
+            yield observations, actions
+            left -= steps
     finally:
         copies.close()
-    flat = observations.reshape(-1, *suite.observation_shape)
-    return Recording(task, flat, actions.reshape(-1), epsilon, seed)
