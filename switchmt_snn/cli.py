@@ -323,8 +323,7 @@ def _profile(argv: list[str]) -> int:
     if len(profiles) > 1:
         report = compare_profiles(profiles, options.out)
     if options.json:
-        facts = [one.facts for one in profiles]
-        print(json.dumps(facts[0] if len(facts) == 1 else facts))
+        print(json.dumps(profiles[0].facts) if len(profiles) == 1 else report.with_suffix(".json").read_text())
         return 0
     _print_profiles([one.facts for one in profiles])
     print(report)

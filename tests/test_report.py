@@ -128,6 +128,8 @@ def test_several_runs_in_one_report(run: Path, tmp_path: Path, capsys: pytest.Ca
     text = " ".join(check(tmp_path / "comparison.html", facts).text)
     assert "2 runs side by side" in text
     assert (run / "profile" / "report.html").exists()
+    out, _ = call(capsys, "profile", run, run, "--decisions", 20, "--out", tmp_path, "--json")
+    assert json.loads(out) == json.loads((tmp_path / "comparison.json").read_text())
 
 
 def test_names_are_escaped(profiled: Path) -> None:
