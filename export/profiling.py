@@ -28,6 +28,7 @@ from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report import Frames, render_report
 from switchmt_snn.export.sample import take_sample
+from switchmt_snn.export.traffic import ann_traffic, traffic
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.files import write_atomically
 from switchmt_snn.learning.run import load_agent
@@ -251,7 +252,11 @@ def _task_facts(
             "power_uw": None if decisions_per_s is None else energy.total_pj * decisions_per_s * 1e-6,
         }
         energies.append(energy.to_dict() | rates)
-    return task.to_dict() | {"evaluation": evaluation, "energy": energies}
+    facts = task.to_dict()
+    for layer, plain in zip(task.layers, facts["layers"], strict=True):
+        plain["accesses"] = asdict(traffic(layer, task.spiking))
+        plain["ann_accesses"] = asdict(ann_traffic(layer))
+    return facts | {"evaluation": evaluation, "energy": energies}
 
 
 def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> TaskProfile:

@@ -128,6 +128,8 @@ def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with (run / "profile" / "layers.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     for task in facts["tasks"]:
+        for layer in task["layers"]:
+            assert layer["accesses"]["weights"] == layer["effective_per_decision"]
         mine = [row for row in rows if row["task"] == task["task"]]
         assert sum(int(row["effective"]) for row in mine) / 52 == pytest.approx(
             task["per_decision"]["acs"] + task["per_decision"]["macs"]
