@@ -301,6 +301,7 @@ def _profile(argv: list[str]) -> int:
     names, rest = _leading_names(argv)
     options = _parse(ProfileOptions, rest, "profile", ProfileOptions())
     from switchmt_snn.export import Profile, compare_profiles, profile, profile_file
+    from switchmt_snn.learning.run_folder import RunFolder
 
     files = [name for name in names if name.endswith(".nir")]
     if (options.observations is not None) != bool(files):
@@ -310,6 +311,8 @@ def _profile(argv: list[str]) -> int:
         )
     if files and (options.decisions, options.checkpoint) != (ProfileOptions.decisions, ProfileOptions.checkpoint):
         raise ConfigError("--decisions and --checkpoint are for runs, expected neither with a NIR file; leave them out")
+    for path in set(names) - set(files):  # all of them, before the first is profiled
+        RunFolder(Path(path)).require()
     profiles: list[Profile] = []
     # With several, --out is the comparison's; each one's own files lie in its own folder.
     out = options.out if len(names) < 2 else None

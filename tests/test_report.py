@@ -121,6 +121,10 @@ def test_a_number_that_is_not_in_profile_json_would_be_noticed(profiled: Path, t
 
 
 def test_several_runs_in_one_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    shutil.rmtree(run / "profile", ignore_errors=True)
+    _, err = call(capsys, "profile", run, tmp_path / "nothing", code=2)
+    assert "no run folder" in err
+    assert not (run / "profile").exists(), "nothing is profiled before all are found"
     out, _ = call(capsys, "profile", run, run, "--decisions", 20, "--target", "cmos45-int8", "--out", tmp_path)
     assert "Per decision, smallest to largest" in out
     facts = json.loads((tmp_path / "comparison.json").read_text())
