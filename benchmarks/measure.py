@@ -11,6 +11,8 @@ from typing import Any
 
 import torch
 
+from switchmt_snn.learning.run_folder import processor
+
 PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "ale-py", "zstandard", "onnxruntime")
 
 
@@ -29,13 +31,8 @@ def times_ms(action: Callable[[], object], repeats: int, warmup: int = 1) -> dic
 def environment() -> dict[str, Any]:
     """Machine and versions."""
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": torch.get_num_threads(),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in PACKAGES},
     }
-
-
-def _processor() -> str:
-    with open("/proc/cpuinfo", encoding="utf-8") as lines:
-        return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")

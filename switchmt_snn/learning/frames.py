@@ -15,7 +15,7 @@ import zstandard
 
 ZSTD_LEVEL = 3
 _BYTES_OBJECT = 33 + 8
-"""What Python adds to a block: the object's head and the reference to it."""
+"""What a block takes beside its content: the head of a bytes object, and the allocator's."""
 
 Slots = npt.NDArray[np.int64]
 Frames = npt.NDArray[Any]

@@ -297,7 +297,7 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
         "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "torch_threads": torch.get_num_threads(),
         "device": str(device),
@@ -318,7 +318,8 @@ def command_line() -> str:
     return shlex.join(["switchmt-snn", *sys.argv[1:]]) if ours else f"python {program}"
 
 
-def _processor() -> str:
+def processor() -> str:
+    """The processor's name, as the system tells it."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
