@@ -21,6 +21,8 @@ import pytest
 import safetensors.torch
 import torch
 
+from switchmt_snn.learning.machine import compile_problem
+
 COMMAND = [sys.executable, "-m", "switchmt_snn"]
 CONFIG = """
 name: resume
@@ -134,6 +136,16 @@ def test_killed_at_random_moments_ends_bitwise_the_same(config: Path, whole: Pat
     assert kills, "no process lived long enough to be killed"
     run("train", config, "--run", folder)
     assert content(folder) == content(whole)
+
+
+@pytest.mark.skipif(compile_problem() is not None, reason="nothing can be compiled here")
+def test_a_compiled_run_continues_exactly_in_another_process(config: Path, tmp_path: Path) -> None:
+    options = ("--learning.engine", "compiled", "--learning.precision", "bfloat16", "--network.encoding", "direct")
+    first = run("train", config, "--run", tmp_path / "whole", *options)
+    assert "updates are compiled" in first.stdout
+    run("train", config, "--run", tmp_path / "parts", *options, "--total-steps", "700")
+    run("train", config, "--run", tmp_path / "parts", *options)
+    assert content(tmp_path / "parts") == content(tmp_path / "whole")
 
 
 def test_killed_while_a_checkpoint_is_written(config: Path, whole: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from switchmt_snn.config import LearningConfig
+from switchmt_snn.learning.engine import q_function
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.spiking.network import QNetwork
@@ -44,12 +45,12 @@ class Learner(Stateful):
     the running statistics of the batch's task.
 
     Attributes:
-        updates: gradient steps made.
-        precision: dtype of synaptic products in an update; acting is always in float32.
+        updates: gradient steps made. They run as ``config.engine`` and ``config.precision`` say; acting is always eager
+            and in float32.
     """
 
     SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
-    DERIVED = ("config", "device", "precision", "_invalid_KA")
+    DERIVED = ("config", "device", "_online_q", "_target_q", "_invalid_KA")
 
     def __init__(
         self,
@@ -61,9 +62,11 @@ class Learner(Stateful):
     ) -> None:
         self.config = config
         self.device = device
-        self.precision = torch.bfloat16 if config.precision == "bfloat16" else None
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
+        precision = torch.bfloat16 if config.precision == "bfloat16" else None
+        self._online_q = q_function(self.network, config.engine, precision)
+        self._target_q = q_function(self.target, config.engine, precision)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon, fused=True
         )
@@ -84,21 +87,21 @@ class Learner(Stateful):
 
     def update(self, batch: Batch, task: int) -> None:
         """One gradient step on a batch of one task."""
-        config, how = self.config, {"generator": self.generator, "precision": self.precision}
+        config, generator = self.config, self.generator
         observations, next_observations = self._tensor(batch.observations), self._tensor(batch.next_observations)
         rewards_B = self._tensor(batch.rewards)
         if config.clip_rewards:
             rewards_B = rewards_B.clamp(-1.0, 1.0)
         with torch.no_grad():
-            q_next_BA = self.target(next_observations, task, **how)
+            q_next_BA = self._target_q(next_observations, task, generator)
             q_choice_BA = q_next_BA
             if config.double_q:
                 self.network.eval()
-                q_choice_BA = self.network(next_observations, task, **how)
+                q_choice_BA = self._online_q(next_observations, task, generator)
             q_choice_BA = q_choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
             target_B = td_target(rewards_B, self._tensor(batch.terminated), q_next_BA, q_choice_BA, config.discount)
         self.network.train()
-        q_BA = self.network(observations, task, **how)
+        q_BA = self._online_q(observations, task, generator)
         q_B = q_BA.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
         loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
         self.optimizer.zero_grad(set_to_none=True)

@@ -16,11 +16,12 @@ import torch
 
 from switchmt_snn import config_io
 from switchmt_snn.config import ExperimentConfig, resolve
-from switchmt_snn.errors import ConfigError, TrainingFailed
+from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.description import describe_method
 from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.learning.events import Event, Stepped
+from switchmt_snn.learning.machine import select_device, settle
 from switchmt_snn.learning.memory import require_memory
 from switchmt_snn.learning.run_folder import (
     RunFolder,
@@ -91,11 +92,11 @@ def train(
     stored = folder.config() if folder.is_run else None
     if config is None:
         config = stored or config_io.load_config("quickstart")
-    config = resolve(config)
-    if stored is not None:
-        check_same_config(stored, config, folder.path)
-    suite = make_suite(config.tasks)
     device = select_device(config.device)
+    config, notes = settle(resolve(config), stored, device)
+    if stored is not None:
+        check_same_config(settle(stored, stored, device)[0], config, folder.path)
+    suite = make_suite(config.tasks)
     torch.backends.cudnn.deterministic = True  # exact resume; benchmark mode would choose kernels by the clock
     if config.threads is not None:
         torch.set_num_threads(config.threads)
@@ -108,7 +109,7 @@ def train(
             folder.save_config(config)
         training = Training(config, suite, device)
         try:
-            return _Driver(folder, training, observers).run()
+            return _Driver(folder, training, observers, notes).run()
         finally:
             training.close()
     finally:
@@ -119,25 +120,13 @@ def _name_of(config: ExperimentConfig | None) -> str:
     return config.name if config is not None else "quickstart"
 
 
-def select_device(wish: str) -> torch.device:
-    """The device for a wish.
-
-    Raises:
-        ConfigError: the wished device is not there.
-    """
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if wish == "auto":
-        return torch.device(next(name for name, present in there.items() if present))
-    if not there[wish]:
-        present = ", ".join(name for name, is_there in there.items() if is_there)
-        raise ConfigError(f"device is {wish!r}, expected one that this machine has ({present}); use device=auto")
-    return torch.device(wish)
-
-
 class _Driver:
     """One call's worth of a run: feeds observers, saves, evaluates, stops."""
 
-    def __init__(self, folder: RunFolder, training: Training, observers: Sequence[Observer]) -> None:
+    def __init__(
+        self, folder: RunFolder, training: Training, observers: Sequence[Observer], notes: Sequence[str]
+    ) -> None:
+        self.notes = notes
         self.folder, self.training, self.observers = folder, training, observers
         self.config = training.config
         self.store = folder.checkpoints(self.config.recording.keep_checkpoints)
@@ -151,7 +140,7 @@ class _Driver:
         if finished and self.folder.has_evaluation(training.steps):
             return RunResult(self.folder.path, "already_finished", training.steps, None)
         try:
-            return self._run(log_sizes, resumed_at, notes)
+            return self._run(log_sizes, resumed_at, [*self.notes, *notes])
         except OSError as error:
             raise TrainingFailed(
                 f"writing to {self.folder.path} failed at step {training.steps} ({error.strerror or error}), expected "

@@ -21,16 +21,27 @@ class ActiveDendrites(nn.Module):
     ``per_neuron``: own segments, N x S x K weights (Iyer et al. 2022, arXiv 2201.00042).
     """
 
+    tasks_K: Tensor
+
     def __init__(self, config: NetworkConfig, num_neurons: int, num_tasks: int) -> None:
         """Draw the segments from N(0, 1), as the released script does."""
         super().__init__()
         rows = num_neurons if config.dendrites == "per_neuron" else 1
         self.segments_NSK = nn.Parameter(torch.randn(rows, config.dendritic_segments, num_tasks))
+        self.register_buffer("tasks_K", torch.arange(num_tasks), persistent=False)
         self.gating = config.dendritic_gating
 
     def forward(self, task: int) -> Tensor:
         """Return the gains for a task: ``[N]`` (per_neuron) or ``[1]`` (shared), each within (0, 1)."""
-        responses_NS = self.segments_NSK[:, :, task]
+        return self.gains(self.index(task))
+
+    def index(self, task: int) -> Tensor:
+        """The task as a tensor ``[1]``."""
+        return self.tasks_K[task : task + 1]
+
+    def gains(self, task_1: Tensor) -> Tensor:
+        """As :meth:`forward`, with the task as a tensor: code that is compiled once serves every task."""
+        responses_NS = self.segments_NSK.index_select(2, task_1).squeeze(2)
         if self.gating == "max":
             chosen_N = responses_NS.amax(dim=1)
         else:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
@@ -40,6 +41,10 @@ CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
 
 State = dict[str, Tensor]
 """Membranes ``[B, ...]`` by layer name; an empty dict is the resting state."""
+
+Context = dict[str, tuple[Tensor, ...]]
+"""All that tells a network its task, by layer name: BatchNorm's running mean and variance ``[C]``, or the dendrites'
+index ``[1]``."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,17 @@ def synaptic_products(synapses: nn.Module, x: Tensor, precision: torch.dtype | N
         return cast(Tensor, synapses(x)).to(x.dtype)
 
 
+class Convolution(nn.Conv2d):
+    """``nn.Conv2d`` without padding; compiled code computes it with channels innermost."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[B, C, H, W]`` to ``[B, O, H', W']``."""
+        if not torch.compiler.is_compiling():
+            return super().forward(x)
+        weight = self.weight.contiguous(memory_format=torch.channels_last)
+        return F.conv2d(x, weight, self.bias, self.stride)
+
+
 class TrunkLayer(nn.Module):
     """Convolution (or linear map), BatchNorm, neurons."""
 
@@ -83,11 +99,15 @@ class TrunkLayer(nn.Module):
         self.normalization = normalization
         self.neurons = neurons
 
-    def current(self, x: Tensor, task: int, precision: torch.dtype | None = None) -> Tensor:
+    def context(self, task: int) -> tuple[Tensor, ...]:
+        """The running mean and variance ``[C]`` of a task, as views; nothing without normalisation."""
+        return () if self.normalization is None else self.normalization.statistics(task)
+
+    def current(self, x: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None = None) -> Tensor:
         """Input currents ``[T, B, ...]`` of the neurons for inputs ``[T, B, ...]``, time folded into the batch."""
         y = synaptic_products(self.synapses, x.flatten(0, 1), precision)
         if self.normalization is not None:
-            y = self.normalization(y, task)
+            y = self.normalization.normalize(y, *context)
         return cast(Tensor, y.unflatten(0, x.shape[:2]))
 
 
@@ -104,11 +124,15 @@ class Stream(nn.Module):
         self.neurons = make_neuron_layer(config, spiking)
         self.head = nn.Linear(hidden, num_outputs)
 
-    def current(self, x_TBN: Tensor, task: int, precision: torch.dtype | None = None) -> Tensor:
+    def context(self, task: int) -> tuple[Tensor, ...]:
+        """The dendrites' index of a task ``[1]``; nothing without dendrites."""
+        return () if self.dendrites is None else (self.dendrites.index(task),)
+
+    def current(self, x_TBN: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None = None) -> Tensor:
         """Gated input currents ``[T, B, N]`` of the hidden neurons: Eq. 1's ``f(sum_i s_i, max_j d_j^T c)``."""
         current_TBN = synaptic_products(self.synapses, x_TBN, precision)
         if self.dendrites is not None:
-            current_TBN = current_TBN * self.dendrites(task)
+            current_TBN = current_TBN * self.dendrites.gains(*context)
         if self.k_winners is not None:
             current_TBN = keep_k_winners(current_TBN, self.k_winners)
         return current_TBN
@@ -158,7 +182,7 @@ class QNetwork(nn.Module):
                 "convolutions need images"
             )
         for index, (out_channels, kernel, stride) in enumerate(CONVOLUTIONS[config.trunk], start=1):
-            convolution = nn.Conv2d(shape[0], out_channels, kernel, stride)
+            convolution = Convolution(shape[0], out_channels, kernel, stride)
             height, width = ((side - kernel) // stride + 1 for side in shape[1:])
             if height < 1 or width < 1:
                 raise ConfigError(
@@ -196,14 +220,35 @@ class QNetwork(nn.Module):
         Returns:
             ``[B, A]`` float Q-values.
         """
+        inputs = self.encode(observation, generator)
+        return self.decide(inputs, self.context(task), state=state, activity=activity, precision=precision)
+
+    def encode(self, observation: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The network's inputs ``[T, B, ...]`` (direct: ``[1, B, ...]``) for raw observations ``[B, *shape]``."""
+        return self.encoder(observation.to(torch.float32) * self.observation.scale, generator)
+
+    def context(self, task: int) -> Context:
+        """What a task changes in the network; the only thing that :meth:`decide` is told of it."""
+        layers = {**self.trunk, **self.streams}
+        return {name: cast(TrunkLayer | Stream, layer).context(task) for name, layer in layers.items()}
+
+    def decide(
+        self,
+        x: Tensor,
+        context: Context,
+        *,
+        state: State | None = None,
+        activity: dict[str, Tensor] | None = None,
+        precision: torch.dtype | None = None,
+    ) -> Tensor:
+        """Q-values ``[B, A]`` of encoded inputs ``[T, B, ...]`` in a task's context; the rest as in :meth:`forward`."""
         state = {} if state is None else state
-        x = self.encoder(observation.to(torch.float32) * self.observation.scale, generator)
         for name, layer in self.trunk.items():
-            current = self._over_time(cast(TrunkLayer, layer).current(x, task, precision))
+            current = self._over_time(cast(TrunkLayer, layer).current(x, context[name], precision))
             x = self._fire(name, cast(TrunkLayer, layer), current, state, activity)
         features_TBN = x.flatten(2)
         outputs = {
-            name: self._readout(name, cast(Stream, stream), features_TBN, task, state, activity, precision)
+            name: self._readout(name, cast(Stream, stream), features_TBN, context[name], state, activity, precision)
             for name, stream in self.streams.items()
         }
         return self._combine(outputs)
@@ -232,13 +277,13 @@ class QNetwork(nn.Module):
         name: str,
         stream: Stream,
         features_TBN: Tensor,
-        task: int,
+        context: tuple[Tensor, ...],
         state: State,
         activity: dict[str, Tensor] | None,
         precision: torch.dtype | None,
     ) -> Tensor:
         """The stream's output: ``[B, outputs]`` (mean, last_membrane) or ``[T, B, outputs]`` (max_membrane)."""
-        spikes_TBN = self._fire(name, stream, stream.current(features_TBN, task, precision), state, activity)
+        spikes_TBN = self._fire(name, stream, stream.current(features_TBN, context, precision), state, activity)
         if self.config.readout == "mean":
             return cast(Tensor, stream.head(spikes_TBN.mean(0)))
         outputs_t = stream.head(spikes_TBN)

@@ -136,6 +136,8 @@ class SpikingLayer(nn.Module):
         """
         if membrane is None:
             membrane = torch.zeros_like(current[0])
+        if torch.compiler.is_compiling() and self.fused:
+            return self._traced(current, membrane)
         if self.fused:
             # The two parameters are fixed numbers; reading them as floats keeps the step free of broadcasts.
             beta, threshold = float(self.leaky.beta.clamp(0, 1)), float(self.leaky.threshold)
@@ -144,6 +146,19 @@ class SpikingLayer(nn.Module):
             )
             return fused
         return self._step_by_step(current, membrane)
+
+    def _traced(self, current: Tensor, membrane: Tensor) -> tuple[Tensor, Tensor]:
+        """The same steps as plain operations, which torch.compile fuses with what stands around them."""
+        beta, threshold, spikes = self.leaky.beta.clamp(0, 1), self.leaky.threshold, []
+        fired = (membrane > threshold).to(current.dtype)
+        for current_t in current:
+            kept = membrane * (1.0 - fired) if self.reset == "zero" else membrane
+            membrane = kept * beta + current_t
+            if self.reset == "subtract":
+                membrane = membrane - fired * threshold
+            spikes.append(self.leaky.spike_grad(membrane - threshold))
+            fired = spikes[-1].detach()
+        return torch.stack(spikes), membrane
 
     def _step_by_step(self, current: Tensor, membrane: Tensor) -> tuple[Tensor, Tensor]:
         spikes = []

@@ -33,7 +33,10 @@ class TaskBatchNorm(nn.Module):
     def forward(self, x: Tensor, task: int) -> Tensor:
         """Normalise by the batch in training mode (and move the task's running statistics), by the task's running
         statistics in eval mode."""
-        mean_C, var_C = self.statistics(task)
+        return self.normalize(x, *self.statistics(task))
+
+    def normalize(self, x: Tensor, mean_C: Tensor, var_C: Tensor) -> Tensor:
+        """As :meth:`forward`, with a task's running statistics handed in (moved in place in training mode)."""
         return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, self.training, self.momentum, self.epsilon)
 
     def statistics(self, task: int) -> tuple[Tensor, Tensor]:

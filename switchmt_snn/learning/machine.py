@@ -1,0 +1,111 @@
+"""What this machine lets a run choose: the device, the updates' precision and engine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.errors import ConfigError
+
+COMPILE_FROM_UPDATES = 50_000
+"""``engine=auto`` compiles runs of at least this many updates: a minute at the start, minutes to hours back."""
+
+
+def select_device(wish: str) -> torch.device:
+    """The device for a wish.
+
+    Raises:
+        ConfigError: the wished device is not there.
+    """
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if wish == "auto":
+        return torch.device(next(name for name, present in there.items() if present))
+    if not there[wish]:
+        present = ", ".join(name for name, is_there in there.items() if is_there)
+        raise ConfigError(f"device is {wish!r}, expected one that this machine has ({present}); use device=auto")
+    return torch.device(wish)
+
+
+def settle(
+    config: ExperimentConfig, stored: ExperimentConfig | None, device: torch.device
+) -> tuple[ExperimentConfig, list[str]]:
+    """Replace ``learning.precision`` and ``learning.engine`` ``auto`` by what this machine can do.
+
+    Both change roundings, so a run that exists keeps what it began with (before there was a choice: eager, float32).
+
+    Args:
+        config: resolved.
+        stored: the config of the run to be continued; None for a new one.
+        device: where the network will run.
+
+    Returns:
+        the config, and what the user should know about the choice.
+
+    Raises:
+        ConfigError: ``compiled`` is asked for and nothing can be compiled here.
+    """
+    learning = config.learning
+    precision, engine = learning.precision, learning.engine
+    notes = []
+    if stored is not None:
+        precision = stored.learning.precision if precision == "auto" else precision
+        engine = stored.learning.engine if engine == "auto" else engine
+        engine = "eager" if engine == "auto" else engine
+    if precision == "auto":
+        precision = "bfloat16" if has_bfloat16(device) else "float32"
+        reason = "has" if precision == "bfloat16" else "has no"
+        notes.append(f"updates compute in {precision}: the {_processor_of(device)} {reason} bfloat16 instructions")
+    if engine == "compiled" or (engine == "auto" and device.type == "cpu" and compiling_pays(config)):
+        problem = compile_problem()
+        if problem is not None and engine == "compiled":
+            raise ConfigError(
+                f"learning.engine is 'compiled' and torch.compile fails on this machine ({problem}), expected a C++ "
+                "compiler that it can use (Debian: apt install g++ python3-dev); install one, or use "
+                "learning.engine=eager"
+            )
+        if problem is not None:
+            notes.append(f"updates run uncompiled: torch.compile fails on this machine ({problem})")
+        else:
+            notes.append(
+                "updates are compiled: the first ones take up to a minute (learning.engine=eager does without)"
+            )
+        engine = "eager" if problem is not None else "compiled"
+    engine = "eager" if engine == "auto" else engine
+    return replace(config, learning=replace(learning, precision=precision, engine=engine)), notes
+
+
+def planned_updates(config: ExperimentConfig) -> int:
+    """Updates that a run of a resolved config makes, warm-ups not subtracted."""
+    learning = config.learning
+    each = len(config.tasks.names) if learning.update_tasks == "all" else 1
+    return config.total_steps // learning.update_every_steps * each
+
+
+def compiling_pays(config: ExperimentConfig) -> bool:
+    """Whether a run is long enough for its compilation."""
+    return planned_updates(config) >= COMPILE_FROM_UPDATES
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether a device multiplies bfloat16 faster than float32."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
+    if device.type != "cpu":
+        return False
+    checks = (getattr(torch.cpu, name, None) for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))
+    return any(check is not None and check() for check in checks)
+
+
+def compile_problem() -> str | None:
+    """The first line of what goes wrong when something small is compiled; None if nothing does."""
+    try:
+        torch.compile(lambda x: x.sin() + 1.0)(torch.ones(8))
+    except Exception as error:
+        return str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+    return None
+
+
+def _processor_of(device: torch.device) -> str:
+    return "processor" if device.type == "cpu" else f"device {device.type}"

@@ -1,0 +1,149 @@
+"""The compiled update against the eager one, and what a run settles on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.config_io import load_config
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning import machine
+from switchmt_snn.learning.engine import q_function
+from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
+from tests.conftest import small_config
+
+CPU = torch.device("cpu")
+IMAGES = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
+
+
+def minatar(**network: Any) -> ExperimentConfig:
+    preset = load_config("minatar")
+    return resolve(replace(preset, network=replace(preset.network, hidden_units=16, **network)))
+
+
+def gradients(network: QNetwork, engine: str, precision: torch.dtype | None, task: int) -> dict[str, torch.Tensor]:
+    """Of a sum over training-mode Q-values; running statistics move, so they are part of the answer."""
+    torch.manual_seed(task)
+    x = (torch.rand(8, *network.observation.shape) < 0.4).to(torch.uint8)
+    network.train().zero_grad()
+    q_BA = q_function(network, engine, precision)(x, task, torch.Generator().manual_seed(5))
+    (q_BA * torch.linspace(-1, 2, q_BA.numel()).view_as(q_BA)).sum().backward()
+    # Each gradient in units of its tensor's largest, which is what Adam makes of it; but a bias before BatchNorm has
+    # none except rounding.
+    grads = {
+        name: p.grad / (1.0 if name.endswith("conv1.synapses.bias") else p.grad.abs().max().clamp(min=1e-9))
+        for name, p in network.named_parameters()
+        if p.grad is not None
+    }
+    return {"q": q_BA.detach(), **grads, **{name: b.clone() for name, b in network.named_buffers()}}
+
+
+compiles = pytest.mark.skipif(machine.compile_problem() is not None, reason="nothing can be compiled here")
+
+
+@compiles
+@pytest.mark.parametrize(
+    "network",
+    [
+        {},
+        {
+            "neuron": "LIF",
+            "reset": "subtract",
+            "surrogate": "fast_sigmoid",
+            "dendrites": "per_neuron",
+            "threshold": 0.2,
+        },
+        {"encoding": "rate", "surrogate": "sigmoid", "readout": "max_membrane", "k_winners": 5},
+        {"method": "DQN_D"},
+    ],
+    ids=["default", "LIF-subtract", "rate", "ANN"],
+)
+def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
+    config = minatar(**network).network
+    eager, compiled = build_network(config, IMAGES, 1), build_network(config, IMAGES, 1)
+    for task in (0, 2):
+        ours, theirs = gradients(compiled, "compiled", None, task), gradients(eager, "eager", None, task)
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            torch.testing.assert_close(
+                ours[name], theirs[name], rtol=1e-3, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
+            )
+        assert any("running" in name and bool((ours[name][task] != 0).any()) for name in ours)
+
+
+@compiles
+def test_compiled_bfloat16_equals_eager_bfloat16() -> None:
+    config = minatar().network
+    eager, compiled = build_network(config, IMAGES, 1), build_network(config, IMAGES, 1)
+    ours, theirs = (
+        gradients(network, engine, torch.bfloat16, 0) for network, engine in ((compiled, "compiled"), (eager, "eager"))
+    )
+    # bfloat16 has 8 bits; a product rounded the other way may move a spike, so most, not all, must agree.
+    for name in ours:
+        close = torch.isclose(ours[name].float(), theirs[name].float(), rtol=0.05, atol=0.02)
+        assert close.float().mean() > 0.97 or not close.numel(), name
+
+
+def test_a_run_keeps_the_engine_it_began_with() -> None:
+    asked = small_config(total_steps=10_000_000, learning={"precision": "auto"})
+    stored = small_config(learning={"engine": "eager", "precision": "float32"})
+    settled, _ = machine.settle(asked, stored, CPU)
+    assert (settled.learning.engine, settled.learning.precision) == ("eager", "float32")
+    before_the_choice = small_config(total_steps=10_000_000)  # a stored config without the field
+    assert machine.settle(asked, before_the_choice, CPU)[0].learning.engine == "eager"
+
+
+@compiles
+def test_auto_compiles_long_runs_only() -> None:
+    short, no_words = machine.settle(small_config(), None, CPU)
+    long, words = machine.settle(small_config(total_steps=machine.COMPILE_FROM_UPDATES), None, CPU)
+    assert (short.learning.engine, no_words) == ("eager", [])
+    assert long.learning.engine == "compiled"
+    assert len(words) == 1
+    assert "first" in words[0]
+    every = {"update_every_steps": 4, "update_tasks": "all"}  # two tasks: one update per two steps
+    assert machine.planned_updates(small_config(total_steps=1000, learning=every)) == 500
+
+
+def test_without_a_compiler_auto_says_so_and_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "compile_problem", lambda: "no g++")
+    settled, words = machine.settle(small_config(total_steps=machine.COMPILE_FROM_UPDATES), None, CPU)
+    assert settled.learning.engine == "eager"
+    assert "no g++" in words[0]
+    with pytest.raises(ConfigError, match=r"learning\.engine is 'compiled'.*no g\+\+.*eager"):
+        machine.settle(small_config(learning={"engine": "compiled"}), None, CPU)
+
+
+@pytest.mark.parametrize(("there", "precision"), [(True, "bfloat16"), (False, "float32")])
+def test_auto_precision_follows_the_processor(monkeypatch: pytest.MonkeyPatch, there: bool, precision: str) -> None:
+    monkeypatch.setattr(machine, "has_bfloat16", lambda device: there)
+    settled, words = machine.settle(small_config(learning={"precision": "auto"}), None, CPU)
+    assert settled.learning.precision == precision
+    assert precision in words[0]
+
+
+def test_bfloat16_instructions_are_those_that_the_system_lists() -> None:
+    listing = Path("/proc/cpuinfo")
+    if not listing.exists():
+        pytest.skip("no /proc/cpuinfo")
+    flags = listing.read_text()
+    assert machine.has_bfloat16(CPU) == ("avx512_bf16" in flags or "amx_tile" in flags)
+
+
+def test_spikes_are_the_same_in_both_engines_where_sums_are_exact() -> None:
+    """The traced neuron without a compiler: the plain operations that torch.compile is given."""
+    from switchmt_snn.spiking.neurons import SpikingLayer
+
+    for changes in ({}, {"neuron": "LIF"}, {"reset": "subtract"}, {"neuron": "LIF", "reset": "subtract"}):
+        layer = SpikingLayer(replace(minatar().network, **changes))
+        current = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 4, 50)).astype(np.float32))
+        spikes, membrane = layer(current)
+        traced_spikes, traced_membrane = layer._traced(current, torch.zeros(4, 50))
+        assert torch.equal(spikes, traced_spikes)
+        assert torch.equal(membrane, traced_membrane)
