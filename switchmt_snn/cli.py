@@ -186,6 +186,8 @@ def _train(argv: list[str]) -> int:
     if config.recording.tensorboard:
         observers.append(TensorBoard())
     result = train(config, options.run, observers)
+    if result.status == "served":
+        return 0
     if options.json:
         scores = None if result.evaluation is None else result.evaluation.to_dict()
         print(json.dumps({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores}))

@@ -224,6 +224,9 @@ class LearningConfig:
     """Transitions that a task must hold before it is sampled; until then its actions are random."""
     update_every_steps: int = 1
     """Agent steps between two updates."""
+    overlap: bool = False
+    """Step the environments on another thread while an update runs. An action is then chosen before the update of its
+    step instead of after it; else the loop is the same."""
     update_tasks: Literal["current", "all"] = "current"
     """Sample the current task's buffer (paper), or make one update from every task's buffer in turn (script)."""
     target_update_every_steps: int = 10_000

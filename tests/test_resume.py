@@ -140,7 +140,15 @@ def test_killed_at_random_moments_ends_bitwise_the_same(config: Path, whole: Pat
 
 @pytest.mark.skipif(compile_problem() is not None, reason="nothing can be compiled here")
 def test_a_compiled_run_continues_exactly_in_another_process(config: Path, tmp_path: Path) -> None:
-    options = ("--learning.engine", "compiled", "--learning.precision", "bfloat16", "--network.encoding", "direct")
+    options = (
+        "--learning.engine",
+        "compiled",
+        "--learning.precision",
+        "bfloat16",
+        "--network.encoding",
+        "direct",
+        "--learning.overlap",
+    )
     first = run("train", config, "--run", tmp_path / "whole", *options)
     assert "updates are compiled" in first.stdout
     run("train", config, "--run", tmp_path / "parts", *options, "--total-steps", "700")

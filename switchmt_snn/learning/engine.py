@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
+from switchmt_snn.learning.processes import ProcessGroup
 from switchmt_snn.spiking.network import Context, QNetwork
+from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 QUpdateFunction = Callable[[Tensor, int, torch.Generator], Tensor]
 """Raw observations ``[B, *shape]`` of a task, and the encoding's random numbers -> Q-values ``[B, A]``."""
@@ -47,3 +50,24 @@ def q_function(network: QNetwork, engine: str, precision: torch.dtype | None) ->
 
     compiled = torch.compile(encode_and_decide, fullgraph=True, dynamic=False)
     return lambda observation, task, generator: compiled(observation, network.context(task))
+
+
+class _Replica(nn.Module):
+    """A network's update function as a module, which is what DistributedDataParallel takes."""
+
+    def __init__(self, network: QNetwork, q: QUpdateFunction) -> None:
+        super().__init__()
+        self.network = network
+        self._q = q
+
+    def forward(self, observation: Tensor, task: int, generator: torch.Generator) -> Tensor:
+        return self._q(observation, task, generator)
+
+
+def divided(network: QNetwork, q: QUpdateFunction, group: ProcessGroup) -> QUpdateFunction:
+    """``q`` for a part of a batch: gradients are averaged and batch statistics pooled over all processes."""
+    for module in network.modules():
+        if isinstance(module, TaskBatchNorm):
+            module.sum_over_processes, module.num_processes = group.sum, group.size
+    replica: QUpdateFunction = DistributedDataParallel(_Replica(network, q), broadcast_buffers=False)
+    return replica

@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from switchmt_snn.config import LearningConfig
-from switchmt_snn.learning.engine import q_function
+from switchmt_snn.learning.engine import divided, q_function
+from switchmt_snn.learning.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.spiking.network import QNetwork
@@ -50,7 +51,7 @@ class Learner(Stateful):
     """
 
     SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
-    DERIVED = ("config", "device", "_online_q", "_target_q", "_invalid_KA")
+    DERIVED = ("config", "device", "_online_q", "_target_q", "_training_q", "_group", "_invalid_KA")
 
     def __init__(
         self,
@@ -59,7 +60,18 @@ class Learner(Stateful):
         valid_actions_KA: npt.NDArray[np.bool_],
         device: torch.device,
         seed: int,
+        group: ProcessGroup | None = None,
     ) -> None:
+        """Take a network over.
+
+        Args:
+            network: fresh or trained; moved to ``device``.
+            config: resolved settings.
+            valid_actions_KA: which actions exist in which task.
+            device: where to learn.
+            seed: of the encoding's random numbers.
+            group: the processes among which updates are divided; None for one process.
+        """
         self.config = config
         self.device = device
         self.network = network.to(device)
@@ -67,6 +79,8 @@ class Learner(Stateful):
         precision = torch.bfloat16 if config.precision == "bfloat16" else None
         self._online_q = q_function(self.network, config.engine, precision)
         self._target_q = q_function(self.target, config.engine, precision)
+        self._group = group
+        self._training_q = self._online_q if group is None else divided(self.network, self._online_q, group)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon, fused=True
         )
@@ -86,7 +100,13 @@ class Learner(Stateful):
             return q_BA.argmax(dim=1).cpu().numpy()  # type: ignore[no-any-return]
 
     def update(self, batch: Batch, task: int) -> None:
-        """One gradient step on a batch of one task."""
+        """One gradient step on a batch of one task; on several processes, called in the first one."""
+        if self._group is not None:
+            self._group.announce(UPDATE, task)
+            batch = self._group.deal(batch)
+        self._gradient_step(batch, task)
+
+    def _gradient_step(self, batch: Batch, task: int) -> None:
         config, generator = self.config, self.generator
         observations, next_observations = self._tensor(batch.observations), self._tensor(batch.next_observations)
         rewards_B = self._tensor(batch.rewards)
@@ -101,7 +121,7 @@ class Learner(Stateful):
             q_choice_BA = q_choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
             target_B = td_target(rewards_B, self._tensor(batch.terminated), q_next_BA, q_choice_BA, config.discount)
         self.network.train()
-        q_BA = self._online_q(observations, task, generator)
+        q_BA = self._training_q(observations, task, generator)
         q_B = q_BA.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
         loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
         self.optimizer.zero_grad(set_to_none=True)
@@ -112,12 +132,17 @@ class Learner(Stateful):
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip_at)
         self.optimizer.step()
         self.updates += 1
-        self.loss_sum += loss.detach()
-        self.q_sum += q_B.detach().mean()
+        means_2 = torch.stack([loss.detach(), q_B.detach().mean()])
+        if self._group is not None:
+            means_2 = self._group.sum(means_2) / self._group.size
+        self.loss_sum += means_2[0]
+        self.q_sum += means_2[1]
         self.summed += 1
 
     def copy_target(self) -> None:
         """Q* <- Q, running statistics included."""
+        if self._group is not None and self._group.rank == 0:
+            self._group.announce(COPY_TARGET)
         self.target.load_state_dict(self.network.state_dict())
 
     def parameters(self) -> Tensor:
@@ -128,7 +153,32 @@ class Learner(Stateful):
         """Put a saved state back; JSON made the optimiser's parameter numbers text."""
         optimizer = state["optimizer"]
         numbered = {int(number): values for number, values in optimizer["state"].items()}
-        super().load_state_dict({**state, "optimizer": {**optimizer, "state": numbered}})
+        state = {**state, "optimizer": {**optimizer, "state": numbered}}
+        super().load_state_dict(state)
+        if self._group is not None and self._group.rank == 0:
+            self._group.announce(LOAD)
+            self._group.share(state)
+
+    def serve(self, like: Batch) -> None:
+        """Another process's part in the updates, until the first one stops.
+
+        Args:
+            like: a batch of the shapes and dtypes that are dealt to this process.
+        """
+        assert self._group is not None
+        while (message := self._group.heard())[0] != STOP:
+            what, task = message
+            if what == UPDATE:
+                self._gradient_step(self._group.dealt(like), task)
+            elif what == COPY_TARGET:
+                self.copy_target()
+            else:
+                super().load_state_dict(self._group.share())
+
+    def close(self) -> None:
+        """Let the other processes go."""
+        if self._group is not None:
+            self._group.announce(STOP)
 
     def take_means(self) -> dict[str, float]:
         """Mean loss and mean Q(s, a) of the updates since the last call; empty if there were none."""

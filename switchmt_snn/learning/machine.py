@@ -29,7 +29,7 @@ def select_device(wish: str) -> torch.device:
 
 
 def settle(
-    config: ExperimentConfig, stored: ExperimentConfig | None, device: torch.device
+    config: ExperimentConfig, stored: ExperimentConfig | None, device: torch.device, processes: int = 1
 ) -> tuple[ExperimentConfig, list[str]]:
     """Replace ``learning.precision`` and ``learning.engine`` ``auto`` by what this machine can do.
 
@@ -39,12 +39,13 @@ def settle(
         config: resolved.
         stored: the config of the run to be continued; None for a new one.
         device: where the network will run.
+        processes: among which updates are divided; only uncompiled ones can be, and only even parts.
 
     Returns:
         the config, and what the user should know about the choice.
 
     Raises:
-        ConfigError: ``compiled`` is asked for and nothing can be compiled here.
+        ConfigError: ``compiled`` is asked for and nothing can be compiled here, or the batch cannot be divided.
     """
     learning = config.learning
     precision, engine = learning.precision, learning.engine
@@ -57,6 +58,9 @@ def settle(
         precision = "bfloat16" if has_bfloat16(device) else "float32"
         reason = "has" if precision == "bfloat16" else "has no"
         notes.append(f"updates compute in {precision}: the {_processor_of(device)} {reason} bfloat16 instructions")
+    if processes > 1:
+        _require_divisible(config, processes)
+        engine = "eager"
     if engine == "compiled" or (engine == "auto" and device.type == "cpu" and compiling_pays(config)):
         problem = compile_problem()
         if problem is not None and engine == "compiled":
@@ -74,6 +78,19 @@ def settle(
         engine = "eager" if problem is not None else "compiled"
     engine = "eager" if engine == "auto" else engine
     return replace(config, learning=replace(learning, precision=precision, engine=engine)), notes
+
+
+def _require_divisible(config: ExperimentConfig, processes: int) -> None:
+    if config.learning.engine == "compiled":
+        raise ConfigError(
+            f"learning.engine is 'compiled', expected eager or auto for the {processes} processes that torchrun started"
+        )
+    size = config.learning.batch_size
+    if size % processes or size // processes < 2:
+        raise ConfigError(
+            f"learning.batch_size is {size}, expected a multiple of the {processes} processes that torchrun started, "
+            "with two transitions for each; change one of the two"
+        )
 
 
 def planned_updates(config: ExperimentConfig) -> int:

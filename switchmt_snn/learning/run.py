@@ -23,6 +23,8 @@ from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, eva
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.machine import select_device, settle
 from switchmt_snn.learning.memory import require_memory
+from switchmt_snn.learning.processes import ProcessGroup, join_processes
+from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.run_folder import (
     RunFolder,
     RunLogs,
@@ -31,7 +33,7 @@ from switchmt_snn.learning.run_folder import (
     latest_run,
     new_run_path,
 )
-from switchmt_snn.learning.training import Training, observation_spec
+from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.make import make_suite
 
@@ -60,7 +62,8 @@ class RunResult:
     """How a call of :func:`train` ended.
 
     Attributes:
-        status: ``finished``, ``stopped`` (by a signal; the same command continues), or ``already_finished``.
+        status: ``finished``, ``stopped`` (by a signal; the same command continues), ``already_finished``, or ``served``
+            (one of the other processes of ``torchrun``).
         evaluation: the final evaluation of a run that finished.
     """
 
@@ -83,17 +86,34 @@ def train(
         run: run folder. One that holds a run of the same config is continued; None makes a new one under ``runs/``.
         observers: progress displays and the like.
 
+    Under ``torchrun`` the first process does all this, and every update is divided among all processes.
+
     Raises:
         SwitchMTError: wrong use (``exit_code`` 2), or a run that failed (``exit_code`` 1).
     """
+    group = join_processes()
+    try:
+        return _serve(group) if group is not None and group.rank > 0 else _train(config, run, observers, group)
+    finally:
+        if group is not None:
+            group.leave()
+
+
+def _train(
+    config: ExperimentConfig | str | Path | None,
+    run: str | Path | None,
+    observers: Sequence[Observer],
+    group: ProcessGroup | None,
+) -> RunResult:
     if isinstance(config, (str, Path)):
         config = config_io.load_config(config)
     folder = RunFolder(Path(run) if run is not None else Path(new_run_path(_name_of(config))))
     stored = folder.config() if folder.is_run else None
     if config is None:
         config = stored or config_io.load_config("quickstart")
-    device = select_device(config.device)
-    config, notes = settle(resolve(config), stored, device)
+    device = select_device(config.device) if group is None else group.device(config.device)
+    processes = 1 if group is None else group.size
+    config, notes = settle(resolve(config), stored, device, processes)
     if stored is not None:
         check_same_config(settle(stored, stored, device)[0], config, folder.path)
     suite = make_suite(config.tasks)
@@ -107,13 +127,27 @@ def train(
             folder.create(config, describe_environment(config, device))
         elif stored != config:
             folder.save_config(config)
-        training = Training(config, suite, device)
+        if group is not None:
+            group.share(config_io.to_dict(config))
+        training = Training(config, suite, device, group)
         try:
             return _Driver(folder, training, observers, notes).run()
         finally:
             training.close()
     finally:
         lock.release()
+
+
+def _serve(group: ProcessGroup) -> RunResult:
+    """The other processes of ``torchrun``: a learner that takes its part in every update."""
+    config = config_io.from_dict(group.share())
+    suite = make_suite(config.tasks)
+    learner = make_learner(config, suite, group.device(config.device), group)
+    size = config.learning.batch_size // group.size
+    observations = np.zeros((size, *suite.observation_shape), suite.frame_dtype)
+    numbers = np.zeros(size, np.int64)
+    learner.serve(Batch(observations, numbers, numbers.astype(np.float32), observations, numbers.astype(np.bool_)))
+    return RunResult(Path(), "served", learner.updates, None)
 
 
 def _name_of(config: ExperimentConfig | None) -> str:

@@ -6,7 +6,8 @@ The loop is a generator of events. It knows no screen and no file format; whoeve
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, LayerHealth, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.memory import GIB, compresses_replay
+from switchmt_snn.learning.processes import ProcessGroup
 from switchmt_snn.learning.replay import FrameReplay
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
@@ -39,6 +41,16 @@ def observation_spec(suite: TaskSuite) -> ObservationSpec:
         num_actions=suite.num_actions,
         num_tasks=len(suite.names),
     )
+
+
+def make_learner(
+    config: ExperimentConfig, suite: TaskSuite, device: torch.device, group: ProcessGroup | None = None
+) -> Learner:
+    """A run's learner with its fresh network; the same in every process of a group, but for the encoding's numbers."""
+    network_seed, _, _, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
+    network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
+    encode = int(encode_seed.generate_state(1)[0]) + (0 if group is None else group.rank)
+    return Learner(network, config.learning, suite.valid_actions_KA, device, encode, group)
 
 
 class Training(Stateful):
@@ -68,18 +80,24 @@ class Training(Stateful):
         "target_clock",
         "metrics_clock",
     )
-    DERIVED = ("config", "suite", "num_envs", "reproducible", "_plays")
+    DERIVED = ("config", "suite", "num_envs", "reproducible", "_plays", "_thread")
 
-    def __init__(self, config: ExperimentConfig, suite: TaskSuite, device: torch.device) -> None:
-        """Prepare a run from a resolved config; nothing is played yet."""
+    def __init__(
+        self, config: ExperimentConfig, suite: TaskSuite, device: torch.device, group: ProcessGroup | None = None
+    ) -> None:
+        """Prepare a run from a resolved config; nothing is played yet.
+
+        Args:
+            config: resolved.
+            suite: its tasks.
+            device: where the network lies.
+            group: the processes among which updates are divided; None for one process.
+        """
         self.config, self.suite = config, suite
         self.num_envs = config.tasks.num_envs
         num_tasks = len(suite.names)
-        network_seed, explore_seed, sample_seed, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
-        network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
-        self.learner = Learner(
-            network, config.learning, suite.valid_actions_KA, device, int(encode_seed.generate_state(1)[0])
-        )
+        seeds = np.random.SeedSequence(config.seed).spawn(4)
+        self.learner = make_learner(config, suite, device, group)
         learning = config.learning
         self.replays = [
             FrameReplay(
@@ -102,12 +120,13 @@ class Training(Stateful):
         self.episodes_in_visit = 0
         self.episodes_by_task = [0] * num_tasks  # episodes that ended
         self.starts_by_task = [0] * num_tasks  # episodes that began; numbers their seeds
-        self.explore_rng = np.random.default_rng(explore_seed)
-        self.sample_rng = np.random.default_rng(sample_seed)
+        self.explore_rng = np.random.default_rng(seeds[1])
+        self.sample_rng = np.random.default_rng(seeds[2])
         self.update_clock = Every(learning.update_every_steps)
         self.target_clock = Every(learning.target_update_every_steps)
         self.metrics_clock = Every(config.recording.metrics_every_steps)
         self.reproducible = True
+        self._thread: ThreadPoolExecutor | None = None
         self._plays: dict[int, Play] = {}  # made at a task's first visit; a task that is left keeps its episodes
 
     def events(self) -> Iterator[Event]:
@@ -123,10 +142,17 @@ class Training(Stateful):
             task, epsilon = self.task, self.epsilon()
             warming_up = self.is_warming_up(task)
             actions = self.select_actions(play, 1.0 if warming_up else epsilon)  # a via epsilon-greedy
-            played = play.step(actions)  # observe r and s'
-            self._remember(play, actions, played)  # store in D_i
-            self._count_steps()
-            self._learn()  # sample from D_i, gradient step
+            if self.config.learning.overlap:
+                stepping = self._beside(play.step, actions)
+                self._learn()  # with what D_i held before this step
+                played = stepping.result()
+                self._remember(play, actions, played)
+                self._count_steps()
+            else:
+                played = play.step(actions)  # observe r and s'
+                self._remember(play, actions, played)  # store in D_i
+                self._count_steps()
+                self._learn()  # sample from D_i, gradient step
             yield from self._end_episodes(play, played, epsilon)  # terminal: H_i, Eq. 3, maybe i <- i + 1 mod |E|
             for _ in range(self.target_clock.advance(self.num_envs)):
                 self.learner.copy_target()  # Q* <- Q
@@ -153,6 +179,14 @@ class Training(Stateful):
             greedy = self.learner.act(play.observations, self.task)
             actions = np.where(explore, actions, greedy)
         return actions
+
+    def _beside(
+        self, step: Callable[[npt.NDArray[np.int64]], VectorStep], actions: npt.NDArray[np.int64]
+    ) -> Future[VectorStep]:
+        """Step the environments on another thread; they share nothing with the learner and the replay."""
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "environments")
+        return self._thread.submit(step, actions)
 
     def _remember(self, play: Play, actions: npt.NDArray[np.int64], played: VectorStep) -> None:
         replay = self.replays[self.task]
@@ -290,5 +324,8 @@ class Training(Stateful):
 
     def close(self) -> None:
         """Free the environments."""
+        if self._thread is not None:
+            self._thread.shutdown()
         for play in self._plays.values():
             play.close()
+        self.learner.close()

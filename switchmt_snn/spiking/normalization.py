@@ -6,6 +6,8 @@ last (docs/algorithm.md, deviation 6). Affine weights are shared always, so the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -29,6 +31,8 @@ class TaskBatchNorm(nn.Module):
         self.register_buffer("running_var_KC", torch.ones(rows, num_channels))
         self.momentum = momentum
         self.epsilon = epsilon
+        self.sum_over_processes: Callable[[Tensor], Tensor] | None = None
+        self.num_processes = 1
 
     def forward(self, x: Tensor, task: int) -> Tensor:
         """Normalise by the batch in training mode (and move the task's running statistics), by the task's running
@@ -37,7 +41,25 @@ class TaskBatchNorm(nn.Module):
 
     def normalize(self, x: Tensor, mean_C: Tensor, var_C: Tensor) -> Tensor:
         """As :meth:`forward`, with a task's running statistics handed in (moved in place in training mode)."""
+        if self.training and self.sum_over_processes is not None:
+            return self._normalize_over_processes(x, mean_C, var_C, self.sum_over_processes)
         return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, self.training, self.momentum, self.epsilon)
+
+    def _normalize_over_processes(
+        self, x: Tensor, mean_C: Tensor, var_C: Tensor, total: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """By the statistics of all processes' parts of a batch, which are of one size."""
+        shape = (1, -1, *(1,) * (x.dim() - 2))
+        others = [d for d in range(x.dim()) if d != 1]
+        count = x.numel() // x.shape[1] * self.num_processes
+        batch_mean_C = total(x.sum(others)) / count
+        centered = x - batch_mean_C.view(shape)
+        batch_var_C = total(centered.square().sum(others)) / count
+        with torch.no_grad():  # the running variance is the unbiased one, as in F.batch_norm
+            mean_C.lerp_(batch_mean_C, self.momentum)
+            var_C.lerp_(batch_var_C * (count / (count - 1)), self.momentum)
+        scale_C = self.weight * (batch_var_C + self.epsilon).rsqrt()
+        return centered * scale_C.view(shape) + self.bias.view(shape)
 
     def statistics(self, task: int) -> tuple[Tensor, Tensor]:
         """Running mean and variance ``[C]`` that eval mode uses for a task (views of the buffers)."""
