@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from threadpoolctl import threadpool_limits
 
 from switchmt_snn.learning.agent import Agent
 
@@ -46,18 +42,6 @@ def active_neurons(agent: Agent, observations: npt.NDArray[Any], task: int, seed
         layer = name if name in agent.network.trunk else "hidden"
         parts.setdefault(layer, []).append(values.flatten(2).numpy() != 0)
     return Activity(q, {name: np.concatenate(layers, axis=2) for name, layers in parts.items()})
-
-
-@contextmanager
-def all_cores() -> Iterator[ThreadPoolExecutor]:
-    """A thread for every core; PyTorch and NumPy's BLAS on one thread each meanwhile."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
 
 
 def chunks(observations: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:

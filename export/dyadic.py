@@ -16,9 +16,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from switchmt_snn.export.activity import all_cores, chunks
+from switchmt_snn.export.activity import chunks
 from switchmt_snn.export.engines import encode
 from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.cores import all_cores
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.network import Stream
 from switchmt_snn.spiking.neurons import SpikingLayer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -100,6 +101,12 @@ class OnnxAgent:
         self._inputs = [value.name for value in self.session.get_inputs()]
         self._generator = torch.Generator()
 
+    def independent(self) -> OnnxAgent:
+        """The same session (onnxruntime's may run in several threads) with random numbers of its own."""
+        other = copy.copy(self)
+        other._generator = torch.Generator()
+        return other
+
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of the ``rate`` encoding."""
         self._generator.manual_seed(seed)
@@ -138,6 +145,12 @@ class NirAgent:
         self.step = int(next(iter(graphs.values())).metadata["training_step"])
         self._generator = torch.Generator()
 
+    def independent(self) -> NirAgent:
+        """The same interpreters (a run keeps nothing) with random numbers of their own."""
+        other = copy.copy(self)
+        other._generator = torch.Generator()
+        return other
+
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of the ``rate`` encoding."""
         self._generator.manual_seed(seed)
@@ -155,14 +168,19 @@ class ComparedAgent:
     """An engine that plays while the trained network is asked about the same observations.
 
     Attributes:
-        decisions: greedy decisions compared so far.
-        equal: of them, those with the same action.
+        compared: for every batch of greedy decisions, how many there were, and how many had the same action.
     """
 
     def __init__(self, engine: DecisionMaker, reference: Agent) -> None:
         self.engine, self.reference = engine, reference
         self.suite, self.step = engine.suite, engine.step
-        self.decisions = self.equal = 0
+        self.compared: list[tuple[int, int]] = []
+
+    def independent(self) -> ComparedAgent:
+        """Both for another thread; what is compared there is counted here as well."""
+        other = ComparedAgent(self.engine.independent(), self.reference.independent())
+        other.compared = self.compared
+        return other
 
     def reseed(self, seed: int) -> None:
         """Restart both."""
@@ -172,6 +190,5 @@ class ComparedAgent:
     def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
         """The engine's Q-values; the comparison is counted."""
         values, expected = self.engine.q_values(observation, task), self.reference.q_values(observation, task)
-        self.decisions += len(values)
-        self.equal += int((values.argmax(axis=1) == expected.argmax(axis=1)).sum())
+        self.compared.append((len(values), int((values.argmax(axis=1) == expected.argmax(axis=1)).sum())))
         return values

@@ -17,11 +17,12 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime
 
-from switchmt_snn.export.activity import active_neurons, all_cores, chunks
+from switchmt_snn.export.activity import active_neurons, chunks
 from switchmt_snn.export.engines import OnnxAgent, encode, onnx_session, read_out
 from switchmt_snn.export.fold import FoldedNetwork
 from switchmt_snn.export.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.cores import all_cores
 
 MIN_EQUAL_ACTIONS = 0.99
 """On real weights, an export that agrees on fewer actions fails."""

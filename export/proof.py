@@ -11,7 +11,6 @@ import nir
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.export.activity import all_cores
 from switchmt_snn.export.dyadic import dyadic_observations, exact_copy
 from switchmt_snn.export.engines import OnnxAgent, encode
 from switchmt_snn.export.fold import FoldedNetwork, fold
@@ -21,6 +20,7 @@ from switchmt_snn.export.simulators import SIMULATORS, quietly, simulate
 from switchmt_snn.export.to_nir import NirProfile, nir_graph
 from switchmt_snn.export.to_onnx import decision_model, step_model
 from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.cores import all_cores
 
 DYADIC_DECISIONS = 32
 SIMULATOR_DECISIONS = 16

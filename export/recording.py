@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import re
 import zipfile
 import zlib
@@ -15,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.activity import all_cores
 from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.cores import all_cores
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -53,10 +52,7 @@ def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recor
     """:func:`recorded_play` of every task in turn; while one is used, the next are being played."""
 
     def one(task: str) -> Recording:
-        network = copy.deepcopy(agent.network)
-        return recorded_play(
-            Agent(network, agent.suite, agent.config, agent.device, agent.step), folder, task, decisions
-        )
+        return recorded_play(agent.independent(), folder, task, decisions)
 
     with all_cores() as pool:
         yield from pool.map(one, agent.suite.names)

@@ -220,8 +220,9 @@ def evaluate_engine(
     settings = replace(config.evaluation, **protocol)
     tasks = None if task is None else (suite.names[suite.index(task)],)
     evaluation = evaluate_agent(compared, EvaluationProtocol.of(settings, config.tasks), tasks)
-    share = compared.equal / max(1, compared.decisions)
-    facts = {"engine": engine, "equal_actions_share": share, "decisions": compared.decisions, **evaluation.to_dict()}
+    decisions, equal = (sum(column) for column in zip(*compared.compared, strict=True))
+    share = equal / decisions
+    facts = {"engine": engine, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
     write_atomically(folder.path / "export" / f"evaluation_{engine}.json", json.dumps(facts, indent=1).encode())
     return evaluation, share
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +14,7 @@ import torch
 
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.errors import TaskError
+from switchmt_snn.learning import evaluation
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.evaluation import (
     EpisodeScore,
@@ -29,10 +33,10 @@ from tests.conftest import CountingEnvironment, small_config, vector_suite
 PROTOCOL = EvaluationProtocol.of(EvaluationConfig(episodes=7, num_envs=3), TasksConfig(suite="minatar"))
 
 
-def minatar_agent() -> Agent:
+def minatar_agent(**network: str) -> Agent:
     config = small_config(
         tasks={"suite": "minatar", "names": ["breakout", "asterix"], "sticky_action_probability": 0.1},
-        network={"trunk": "minatar", "threshold": 0.3},
+        network={"trunk": "minatar", "threshold": 0.3, **network},
     )
     suite = make_suite(config.tasks)
     return Agent(build_network(config.network, observation_spec(suite), 3), suite, config, torch.device("cpu"), 12)
@@ -40,7 +44,7 @@ def minatar_agent() -> Agent:
 
 def test_every_episode_is_played_once_with_its_own_seed() -> None:
     suite = vector_suite(lambda task, n: CountingEnvironment(task, n, 9), 4)
-    scores = play_episodes("agent", lambda x, task: np.tile([[0.0, 2.0]], (len(x), 1)), suite, 1, PROTOCOL, 0.0)
+    scores = play_episodes("agent", lambda x, task: np.tile([[0.0, 2.0]], (len(x), 1)), suite, 1, range(7), 10_000, 0.0)
     assert [score.episode for score in scores] == list(range(7))
     assert len({score.seed for score in scores}) == 7
     assert all(score.score == 45 and score.length_steps == 9 and score.mean_q == 2.0 for score in scores)
@@ -52,6 +56,21 @@ def test_deterministic_for_a_seed() -> None:
     assert one == two
     other = evaluate_agent(minatar_agent(), replace(PROTOCOL, seed=1))
     assert [e.score for e in other.episodes] != [e.score for e in one.episodes]
+
+
+@pytest.mark.parametrize(("encoding", "engine"), [("direct", "fused"), ("rate", "fused"), ("direct", "snntorch")])
+def test_threads_play_what_one_after_the_other_plays(encoding: str, engine: str, monkeypatch) -> None:
+    """snnTorch's neurons write into themselves and random encodings draw: neither is shared between threads."""
+
+    @contextmanager
+    def one_core() -> Iterator[ThreadPoolExecutor]:
+        with ThreadPoolExecutor(1) as pool:
+            yield pool
+
+    agent = minatar_agent(encoding=encoding, neuron_engine=engine)
+    threads = evaluate_agent(agent, PROTOCOL)
+    monkeypatch.setattr(evaluation, "all_cores", one_core)
+    assert evaluate_agent(agent, PROTOCOL) == threads
 
 
 def test_scores_do_not_depend_on_how_many_play_side_by_side() -> None:

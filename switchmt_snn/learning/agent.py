@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,10 @@ class Agent:
         self.step = step
         self._generator = torch.Generator(device).manual_seed(config.seed)
         self._invalid_KA = torch.as_tensor(~suite.valid_actions_KA, device=device)
+
+    def independent(self) -> Agent:
+        """The same agent for another thread (snnTorch's neurons write into themselves, a generator moves on)."""
+        return Agent(copy.deepcopy(self.network), self.suite, self.config, self.device, self.step)
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of the ``rate`` encoding, the only randomness of a greedy decision."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.config import EvaluationConfig, TasksConfig
+from switchmt_snn.learning.cores import all_cores
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -23,6 +24,9 @@ class DecisionMaker(Protocol):
 
     suite: TaskSuite
     step: int
+
+    def independent(self) -> DecisionMaker:
+        """The same agent for another thread: it shares nothing with this one that changes."""
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of a random encoding."""
@@ -126,19 +130,31 @@ def evaluate_agent(
 ) -> Evaluation:
     """Play ``protocol.episodes`` episodes of each task with the agent and with the random policy.
 
-    Deterministic for a protocol: an episode's environment and its random actions come from (seed, task, episode).
+    Deterministic for a protocol: an episode's environment and its random actions come from (seed, task, episode), and
+    ``protocol.num_envs`` episodes are played side by side. The groups are spread over all cores.
 
     Raises:
         TaskError: a task is not one of the agent's.
     """
     suite = agent.suite
     names = tasks or suite.names
-    episodes: list[EpisodeScore] = []
-    for name in names:
-        task = suite.index(name)
-        agent.reseed(protocol.seed)
-        episodes += play_episodes("agent", agent.q_values, suite, task, protocol, protocol.epsilon)
-        episodes += play_episodes("random", None, suite, task, protocol, 1.0)
+    groups = [
+        (policy, suite.index(name), range(first, min(first + protocol.num_envs, protocol.episodes)))
+        for policy in ("agent", "random")
+        for name in names
+        for first in range(0, protocol.episodes, protocol.num_envs)
+    ]
+
+    def played(group: tuple[str, int, range]) -> list[EpisodeScore]:
+        policy, task, numbers = group
+        if policy == "random":
+            return play_episodes(policy, None, suite, task, numbers, protocol.seed, 1.0)
+        own = agent.independent()
+        own.reseed(episode_seed(protocol.seed, task, numbers[0]))
+        return play_episodes(policy, own.q_values, suite, task, numbers, protocol.seed, protocol.epsilon)
+
+    with all_cores() as pool:
+        episodes = [episode for group in pool.map(played, groups) for episode in group]
     rows = []
     for policy in ("agent", "random"):
         for name in names:
@@ -147,12 +163,28 @@ def evaluate_agent(
 
 
 def play_episodes(
-    policy: str, q_function: QFunction | None, suite: TaskSuite, task: int, protocol: EvaluationProtocol, epsilon: float
+    policy: str,
+    q_function: QFunction | None,
+    suite: TaskSuite,
+    task: int,
+    numbers: Sequence[int],
+    seed: int,
+    epsilon: float,
 ) -> list[EpisodeScore]:
-    """Play episodes side by side with epsilon-greedy actions; ``q_function`` None plays at random."""
-    play = Play(suite, task, protocol.num_envs)
+    """Play episodes of a task side by side with epsilon-greedy actions.
+
+    Args:
+        policy: its name in the scores.
+        q_function: None plays at random.
+        suite: the tasks.
+        task: index.
+        numbers: of the episodes.
+        seed: root of the episodes' seeds.
+        epsilon: share of random actions.
+    """
+    play = Play(suite, task, len(numbers))
     try:
-        return sorted(_played(policy, q_function, suite, play, protocol, epsilon), key=lambda score: score.episode)
+        return sorted(_played(policy, q_function, suite, play, numbers, seed, epsilon), key=lambda e: e.episode)
     finally:
         play.close()
 
@@ -162,46 +194,41 @@ def _played(
     q_function: QFunction | None,
     suite: TaskSuite,
     play: Play,
-    protocol: EvaluationProtocol,
+    numbers: Sequence[int],
+    seed: int,
     epsilon: float,
 ) -> Iterator[EpisodeScore]:
     n, task = play.num_envs, play.task
     valid = np.flatnonzero(suite.valid_actions_KA[task])
-    waiting = iter(range(n, protocol.episodes))
-    running: list[int | None] = list(range(n))
-    rngs = [np.random.default_rng([protocol.seed, task, episode]) for episode in range(n)]
-    q_sums = np.zeros(n)
-    seeds = np.asarray([episode_seed(protocol.seed, task, episode) for episode in range(n)], np.int64)
+    rngs = [np.random.default_rng([seed, task, number]) for number in numbers]
+    seeds = np.asarray([episode_seed(seed, task, number) for number in numbers], np.int64)
+    running, q_sums = np.ones(n, np.bool_), np.zeros(n)
     play.begin(np.arange(n), seeds)
-    while any(episode is not None for episode in running):
+    while running.any():
         explore = np.asarray([rng.random() < epsilon for rng in rngs])
         actions = np.asarray([valid[rng.integers(len(valid))] for rng in rngs], np.int64)
         if q_function is not None:
-            q_nA = q_function(play.observations, task)
-            q_sums += q_nA.max(axis=1)
-            actions = np.where(explore, actions, q_nA.argmax(axis=1))
+            asked = np.flatnonzero(running)
+            q_nA = q_function(play.observations[asked], task)
+            q_sums[asked] += q_nA.max(axis=1)
+            actions[asked] = np.where(explore[asked], actions[asked], q_nA.argmax(axis=1))
         played = play.step(actions)
         for env in played.ended:
-            episode = running[env]
-            if episode is not None:
+            if running[env]:
                 length = int(play.lengths_steps[env])
                 yield EpisodeScore(
                     policy=policy,
                     task=suite.names[task],
-                    episode=episode,
+                    episode=numbers[env],
                     seed=int(seeds[env]),
                     score=float(play.returns[env]),
                     length_steps=length,
                     mean_q=None if q_function is None else float(q_sums[env]) / length,
                     truncated=bool(played.truncated[env]) and not bool(played.terminated[env]),
                 )
-            running[env] = next(waiting, None)
-            if (following := running[env]) is not None:
-                seeds[env] = episode_seed(protocol.seed, task, following)
-                rngs[env] = np.random.default_rng([protocol.seed, task, following])
-            # An idle copy starts its last episode again, unobserved: environments must not be stepped past an end.
+            running[env] = False
+            # An idle copy starts its episode again, unobserved: environments must not be stepped past an end.
             play.begin(np.asarray([env]), seeds[env : env + 1])
-            q_sums[env] = 0.0
 
 
 def summarize(suite: TaskSuite, episodes: list[EpisodeScore]) -> TaskScore:
