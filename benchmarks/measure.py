@@ -25,7 +25,36 @@ def times_ms(action: Callable[[], object], repeats: int, warmup: int = 1) -> dic
         started = time.perf_counter()
         action()
         times.append((time.perf_counter() - started) * 1e3)
-    return {"median_ms": statistics.median(times), "min_ms": min(times), "max_ms": max(times)}
+    return summary(times)
+
+
+def matmul_gflops(dtype: torch.dtype, device: str = "cpu", size: int = 2048) -> float:
+    """The machine's ceiling for products: the fastest of some square matrix products, in 1e9 operations per second."""
+    a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+
+    def product() -> None:
+        torch.mm(a, b)
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    return 2.0 * size**3 / times_ms(product, 10, warmup=2)["min_ms"] / 1e6
+
+
+def interleaved_ms(actions: dict[str, Callable[[], object]], repeats: int, warmup: int = 2) -> dict[str, list[float]]:
+    """Times of every action in milliseconds; each round runs each once, so that a slow moment hits all of them."""
+    times: dict[str, list[float]] = {name: [] for name in actions}
+    for round_ in range(repeats + warmup):
+        for name, action in actions.items():
+            started = time.perf_counter()
+            action()
+            if round_ >= warmup:
+                times[name].append((time.perf_counter() - started) * 1e3)
+    return times
+
+
+def summary(values: list[float]) -> dict[str, float]:
+    """Median and spread of times in milliseconds."""
+    return {"median_ms": statistics.median(values), "min_ms": min(values), "max_ms": max(values)}
 
 
 def environment() -> dict[str, Any]:

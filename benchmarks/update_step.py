@@ -1,17 +1,20 @@
 """One gradient step, ours against peers, interleaved in one process: double DQN, dueling network with dendrites, Adam.
 
-``python -m benchmarks.update_step [--batch 32] [--timesteps 4] [--repeats 15] [--json]``. All variants have the same
-layers and the same random batch. SpikingJelly takes part where it is installed (extra ``simulators``).
+``python -m benchmarks.update_step [--batch 32] [--timesteps 4] [--repeats 15] [--device cpu] [--json]``. All variants
+have the same layers and the same random batch. SpikingJelly takes part where it is installed (extra ``simulators``).
+
+The physical limit of a variant is the time of its products alone (forward for Q*, Q and training, backward for weights
+and inputs; the first layer once for all T) at the speed of a large matrix product of its precision on this machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import functools
 import importlib.util
 import json
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -23,7 +26,7 @@ import torch.nn.functional as F
 from snntorch import surrogate
 from torch import Tensor, nn
 
-from benchmarks.measure import environment
+from benchmarks.measure import environment, interleaved_ms, matmul_gflops, summary
 from switchmt_snn import config_io
 from switchmt_snn.config import ExperimentConfig, resolve
 from switchmt_snn.learning.learner import Learner
@@ -34,6 +37,7 @@ from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 ACTIONS = 18
+PLAIN = "plain loop over snn.Leaky"
 
 
 class PlainLoop(nn.Module):
@@ -104,15 +108,16 @@ def spikingjelly_network(timesteps: int) -> nn.Module:
     return MultiStep()
 
 
-def peer_update(network: nn.Module, batch: Batch, bf16: bool) -> Callable[[], None]:
+def peer_update(network: nn.Module, batch: Batch, bf16: bool, device: str) -> Callable[[], None]:
     """The same double-DQN step around somebody else's network."""
+    network = network.to(device)
     target = copy.deepcopy(network).eval()
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-4, fused=True)
-    x, x_next = (torch.from_numpy(o).float() / 255 for o in (batch.observations, batch.next_observations))
-    actions, rewards = torch.from_numpy(batch.actions)[:, None], torch.from_numpy(batch.rewards)
+    x, x_next = (torch.from_numpy(o).to(device).float() / 255 for o in (batch.observations, batch.next_observations))
+    actions, rewards = torch.from_numpy(batch.actions).to(device)[:, None], torch.from_numpy(batch.rewards).to(device)
 
     def q(module: nn.Module, inputs: Tensor) -> Tensor:
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        with torch.autocast(device, torch.bfloat16, enabled=bf16):
             return module(inputs).float()  # type: ignore[no-any-return]
 
     def step() -> None:
@@ -129,16 +134,31 @@ def peer_update(network: nn.Module, batch: Batch, bf16: bool) -> Callable[[], No
     return step
 
 
-def our_update(config: ExperimentConfig, suite: TaskSuite, batch: Batch) -> Callable[[], None]:
-    """The learner's own step."""
+def our_learner(config: ExperimentConfig, suite: TaskSuite, device: str) -> Learner:
+    """The learner of a run with this config."""
     resolved = resolve(config)
     network = build_network(resolved.network, observation_spec(suite), 1)
-    learner = Learner(network, resolved.learning, suite.valid_actions_KA, torch.device("cpu"), 1)
-    return lambda: learner.update(batch, 0)
+    return Learner(network, resolved.learning, suite.valid_actions_KA, torch.device(device), 1)
 
 
-def variants(batch_size: int, timesteps: int) -> dict[str, Callable[[], None]]:
-    """Every step by name; the first is the one that ratios refer to."""
+def update_gigaoperations(learner: Learner, batch: Batch) -> float:
+    """Operations of an update's products in 1e9, two for a multiply-accumulate."""
+    macs: dict[nn.Module, float] = {}
+
+    def count(module: nn.Module, inputs: Any, output: Tensor) -> None:
+        macs[module] = float(output.numel() * module.weight[0].numel())  # type: ignore[index, operator, union-attr]
+
+    layers = [module for module in learner.network.modules() if isinstance(module, (nn.Conv2d, nn.Linear))]
+    hooks = [module.register_forward_hook(count) for module in layers]
+    learner.act(batch.observations, 0)
+    for hook in hooks:
+        hook.remove()
+    forward, first = sum(macs.values()), next(iter(macs.values()))
+    return 2e-9 * (3 * forward + 2 * forward - first)  # no gradient for the observations
+
+
+def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Callable[[], None]], dict[str, float]]:
+    """Every step by name, the first being the one that ratios refer to; and their limits in milliseconds."""
     base = config_io.load_config("quickstart")
     suite = make_suite(base.tasks)
     rng = np.random.default_rng(0)
@@ -146,45 +166,55 @@ def variants(batch_size: int, timesteps: int) -> dict[str, Callable[[], None]]:
     rewards = rng.normal(size=batch_size).astype(np.float32)
     batch = Batch(frames[0], rng.integers(0, ACTIONS, batch_size), rewards, frames[1], np.zeros(batch_size, np.bool_))
     torch.manual_seed(0)
-    steps = {"plain loop over snn.Leaky": peer_update(PlainLoop(timesteps), batch, False)}
+    gflops = {name: matmul_gflops(getattr(torch, name), device) for name in ("float32", "bfloat16")}
+    steps: dict[str, Callable[[], None]] = {PLAIN: peer_update(PlainLoop(timesteps), batch, False, device)}
+    limits, precisions = {}, {PLAIN: "float32"}
     if importlib.util.find_spec("spikingjelly"):
         network = spikingjelly_network(timesteps)
-        for precision, bf16 in (("float32", False), ("bfloat16", True)):
-            steps[f"SpikingJelly multi-step, {precision}"] = peer_update(copy.deepcopy(network), batch, bf16)
-    for method in ("SwitchMT", "DQN_D"):
-        for precision in ("float32", "bfloat16"):
-            config = replace(
-                base,
-                network=replace(base.network, method=method, timesteps=timesteps),
-                learning=replace(base.learning, precision=precision),
-            )
-            name = "ours" if method == "SwitchMT" else "our ANN of the same shape"
-            steps[f"{name}, {precision}"] = our_update(config, suite, batch)
-    return steps
+        for precision in gflops:
+            name = f"SpikingJelly multi-step, {precision}"
+            steps[name] = peer_update(copy.deepcopy(network), batch, precision == "bfloat16", device)
+            precisions[name] = precision
+    work = {}
+    for method, label in (("SwitchMT", "ours"), ("DQN_D", "our ANN of the same shape")):
+        for precision in gflops:
+            for engine in ("eager", "compiled"):
+                config = replace(
+                    base,
+                    network=replace(base.network, method=method, timesteps=timesteps),
+                    learning=replace(base.learning, precision=precision, engine=engine),
+                )
+                learner = our_learner(config, suite, device)
+                work[label] = update_gigaoperations(learner, batch)
+                name = f"{label}, {precision}, {engine}"
+                steps[name] = functools.partial(learner.update, batch, 0)
+                limits[name] = work[label] / gflops[precision] * 1e3
+    limits |= {name: work["ours"] / gflops[precision] * 1e3 for name, precision in precisions.items()}
+    return steps, limits
 
 
-def measure(batch_size: int, timesteps: int, repeats: int) -> dict[str, Any]:
-    """Interleaved: every round runs every variant once, so that a slow moment of the machine hits all of them."""
-    steps = variants(batch_size, timesteps)
-    times: dict[str, list[float]] = {name: [] for name in steps}
-    for round_ in range(repeats + 2):
-        for name, step in steps.items():
-            started = time.perf_counter()
-            step()
-            if round_ >= 2:
-                times[name].append((time.perf_counter() - started) * 1e3)
-    slowest = statistics.median(next(iter(times.values())))
+def measure(batch_size: int, timesteps: int, repeats: int, device: str = "cpu") -> dict[str, Any]:
+    """All variants, interleaved."""
+    steps, limits = variants(batch_size, timesteps, device)
+    if device == "cuda":
+        steps = {name: functools.partial(_synchronized, step) for name, step in steps.items()}
+    times = interleaved_ms(steps, repeats, warmup=4)
+    slowest = statistics.median(times[PLAIN])
     rows = {
         name: {
-            "median_ms": statistics.median(values),
-            "min_ms": min(values),
-            "max_ms": max(values),
+            **summary(values),
             "faster_than_plain_loop": slowest / statistics.median(values),
+            "limit_ms": limits[name],
         }
         for name, values in times.items()
     }
-    facts = {"batch": batch_size, "timesteps": timesteps, "repeats": repeats}
+    facts = {"batch": batch_size, "timesteps": timesteps, "repeats": repeats, "device": device}
     return {**facts, "variants": rows, "environment": environment()}
+
+
+def _synchronized(step: Callable[[], None]) -> None:
+    step()
+    torch.cuda.synchronize()
 
 
 def main() -> None:
@@ -193,17 +223,18 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--timesteps", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    result = measure(options.batch, options.timesteps, options.repeats)
+    result = measure(options.batch, options.timesteps, options.repeats, options.device)
     if options.json:
         print(json.dumps(result, indent=1))
         return
-    print(f"{'variant':38}{'median ms':>10}{'min':>8}{'max':>8}{'x plain':>9}")
+    print(f"{'variant':38}{'median ms':>10}{'min':>8}{'max':>8}{'x plain':>9}{'limit':>8}")
     for name, row in result["variants"].items():
         print(
             f"{name:38}{row['median_ms']:10.1f}{row['min_ms']:8.1f}{row['max_ms']:8.1f}"
-            f"{row['faster_than_plain_loop']:9.2f}"
+            f"{row['faster_than_plain_loop']:9.2f}{row['limit_ms']:8.1f}"
         )
 
 

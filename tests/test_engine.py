@@ -14,8 +14,8 @@ from switchmt_snn.config import ExperimentConfig, resolve
 from switchmt_snn.config_io import load_config
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning import machine
-from switchmt_snn.learning.engine import q_function
-from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
+from switchmt_snn.learning.engine import make_evaluate
+from switchmt_snn.spiking.network import ObservationSpec, build_network
 from tests.conftest import small_config
 
 CPU = torch.device("cpu")
@@ -27,13 +27,18 @@ def minatar(**network: Any) -> ExperimentConfig:
     return resolve(replace(preset, network=replace(preset.network, hidden_units=16, **network)))
 
 
-def gradients(network: QNetwork, engine: str, precision: torch.dtype | None, task: int) -> dict[str, torch.Tensor]:
-    """Of a sum over training-mode Q-values; running statistics move, so they are part of the answer."""
+def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | None, task: int) -> dict[str, Any]:
+    """The three values of an update, the gradients of a sum over the first, and the running statistics."""
+    network, target = build_network(config.network, IMAGES, 1), build_network(config.network, IMAGES, 2)
+    target.eval()
     torch.manual_seed(task)
-    x = (torch.rand(8, *network.observation.shape) < 0.4).to(torch.uint8)
-    network.train().zero_grad()
-    q_BA = q_function(network, engine, precision)(x, task, torch.Generator().manual_seed(5))
+    x, following = (torch.rand(2, 8, *IMAGES.shape) < 0.4).to(torch.uint8)
+    evaluate = make_evaluate(network, target, engine, precision, double_q=True)
+    values = evaluate(x, following, task, torch.Generator().manual_seed(5))
+    q_BA = values.q_BA
     (q_BA * torch.linspace(-1, 2, q_BA.numel()).view_as(q_BA)).sum().backward()
+    assert not values.next_BA.requires_grad
+    assert not torch.equal(values.next_BA, values.choice_BA)
     # Each gradient in units of its tensor's largest, which is what Adam makes of it; but a bias before BatchNorm has
     # none except rounding.
     grads = {
@@ -41,7 +46,7 @@ def gradients(network: QNetwork, engine: str, precision: torch.dtype | None, tas
         for name, p in network.named_parameters()
         if p.grad is not None
     }
-    return {"q": q_BA.detach(), **grads, **{name: b.clone() for name, b in network.named_buffers()}}
+    return {**{k: v.detach() for k, v in values._asdict().items()}, **grads, **dict(network.named_buffers())}
 
 
 compiles = pytest.mark.skipif(machine.compile_problem() is not None, reason="nothing can be compiled here")
@@ -65,10 +70,8 @@ compiles = pytest.mark.skipif(machine.compile_problem() is not None, reason="not
     ids=["default", "LIF-subtract", "rate", "ANN"],
 )
 def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
-    config = minatar(**network).network
-    eager, compiled = build_network(config, IMAGES, 1), build_network(config, IMAGES, 1)
     for task in (0, 2):
-        ours, theirs = gradients(compiled, "compiled", None, task), gradients(eager, "eager", None, task)
+        ours, theirs = (gradients(minatar(**network), engine, None, task) for engine in ("compiled", "eager"))
         assert ours.keys() == theirs.keys()
         for name in ours:
             torch.testing.assert_close(
@@ -79,11 +82,7 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
 
 @compiles
 def test_compiled_bfloat16_equals_eager_bfloat16() -> None:
-    config = minatar().network
-    eager, compiled = build_network(config, IMAGES, 1), build_network(config, IMAGES, 1)
-    ours, theirs = (
-        gradients(network, engine, torch.bfloat16, 0) for network, engine in ((compiled, "compiled"), (eager, "eager"))
-    )
+    ours, theirs = (gradients(minatar(), engine, torch.bfloat16, 0) for engine in ("compiled", "eager"))
     # bfloat16 has 8 bits; a product rounded the other way may move a spike, so most, not all, must agree.
     for name in ours:
         close = torch.isclose(ours[name].float(), theirs[name].float(), rtol=0.05, atol=0.02)

@@ -1,6 +1,6 @@
-"""How an update's networks are run: operation by operation, or compiled by ``torch.compile``.
+"""How an update's three forward passes are run: operation by operation, compiled, or divided among processes.
 
-A compiled network computes the same function with other roundings (a test compares the two). One compilation serves all
+Compiled code computes the same function with other roundings (a test compares the two). One compilation serves all
 tasks, because a task enters as tensors (:meth:`QNetwork.context`), and all steps, because an update's batch has one
 size. It is never given up midway: what cannot be compiled as a whole raises.
 """
@@ -8,6 +8,7 @@ size. It is never given up midway: what cannot be compiled as a whole raises.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,57 +18,88 @@ from switchmt_snn.learning.processes import ProcessGroup
 from switchmt_snn.spiking.network import Context, QNetwork
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
-QUpdateFunction = Callable[[Tensor, int, torch.Generator], Tensor]
-"""Raw observations ``[B, *shape]`` of a task, and the encoding's random numbers -> Q-values ``[B, A]``."""
+
+class Values(NamedTuple):
+    """What Eq. 2 needs, each ``[B, A]``."""
+
+    q_BA: Tensor
+    """Q of the observations, in training mode, with a gradient."""
+    next_BA: Tensor
+    """Q* of the next observations, in eval mode."""
+    choice_BA: Tensor
+    """Q of the next observations, in eval mode; Q* without double Q-learning."""
 
 
-def q_function(network: QNetwork, engine: str, precision: torch.dtype | None) -> QUpdateFunction:
-    """The network as an update runs it.
+Evaluate = Callable[[Tensor, Tensor, int, torch.Generator], Values]
+"""Raw observations and next observations ``[B, *shape]`` of a task, and the encoding's random numbers."""
+
+_Forward = Callable[[Tensor, Context], Tensor]
+
+
+def make_evaluate(
+    network: QNetwork,
+    target: QNetwork,
+    engine: str,
+    precision: torch.dtype | None,
+    double_q: bool,
+    group: ProcessGroup | None = None,
+) -> Evaluate:
+    """The forward passes of an update.
 
     Args:
-        network: read at every call; its mode and its weights may change.
+        network: Q; read at every call.
+        target: Q*; likewise.
         engine: ``compiled``, or anything else for eager.
         precision: see :func:`~switchmt_snn.spiking.network.synaptic_products`.
+        double_q: whether Q chooses the next action.
+        group: the processes among which a batch is divided (eager only).
     """
-    if engine != "compiled":
-        return lambda observation, task, generator: network(observation, task, generator=generator, precision=precision)
-    from torch import _dynamo as dynamo  # takes a second to import
+    random = network.encoder.is_random
+    trained: _Forward = _Replica(network, precision)
+    if group is not None:
+        for module in network.modules():
+            if isinstance(module, TaskBatchNorm):
+                module.sum_over_processes, module.num_processes = group.sum, group.size
+        trained = DistributedDataParallel(trained, broadcast_buffers=False)
 
-    # One code object is compiled anew for training and evaluation mode and for every learner of the process.
-    dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, 256)
+    def values(x: Tensor, x_next: Tensor, x_choice: Tensor, context: Context, target_context: Context) -> Values:
+        if not random:  # raw observations; the generator's numbers are drawn outside of compiled code
+            x, x_next, x_choice = (network.encode(observation) for observation in (x, x_next, x_choice))
+        with torch.no_grad():
+            choice_BA = next_BA = target.decide(x_next, target_context, precision=precision, training=False)
+            if double_q:
+                choice_BA = network.decide(x_choice, context, precision=precision, training=False)
+        return Values(trained(x, context), next_BA, choice_BA)
 
-    def decide(x: Tensor, context: Context) -> Tensor:
-        return network.decide(x, context, precision=precision)
+    run = _compiled(values) if engine == "compiled" else values
 
-    if network.encoder.is_random:  # the generator's numbers are drawn outside of compiled code
-        decided = torch.compile(decide, fullgraph=True, dynamic=False)
-        return lambda observation, task, generator: decided(
-            network.encode(observation, generator), network.context(task)
-        )
+    def evaluate(observation: Tensor, following: Tensor, task: int, generator: torch.Generator) -> Values:
+        context, target_context = network.context(task), target.context(task)
+        if not random:
+            return run(observation, following, following, context, target_context)
+        x_next = target.encode(following, generator)
+        x_choice = network.encode(following, generator) if double_q else x_next
+        return run(network.encode(observation, generator), x_next, x_choice, context, target_context)
 
-    def encode_and_decide(observation: Tensor, context: Context) -> Tensor:
-        return decide(network.encode(observation), context)
-
-    compiled = torch.compile(encode_and_decide, fullgraph=True, dynamic=False)
-    return lambda observation, task, generator: compiled(observation, network.context(task))
+    return evaluate
 
 
 class _Replica(nn.Module):
-    """A network's update function as a module, which is what DistributedDataParallel takes."""
+    """The pass that is differentiated, as a module, which is what DistributedDataParallel takes."""
 
-    def __init__(self, network: QNetwork, q: QUpdateFunction) -> None:
+    def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
         super().__init__()
         self.network = network
-        self._q = q
+        self.precision = precision
 
-    def forward(self, observation: Tensor, task: int, generator: torch.Generator) -> Tensor:
-        return self._q(observation, task, generator)
+    def forward(self, x: Tensor, context: Context) -> Tensor:
+        return self.network.decide(x, context, precision=self.precision, training=True)
 
 
-def divided(network: QNetwork, q: QUpdateFunction, group: ProcessGroup) -> QUpdateFunction:
-    """``q`` for a part of a batch: gradients are averaged and batch statistics pooled over all processes."""
-    for module in network.modules():
-        if isinstance(module, TaskBatchNorm):
-            module.sum_over_processes, module.num_processes = group.sum, group.size
-    replica: QUpdateFunction = DistributedDataParallel(_Replica(network, q), broadcast_buffers=False)
-    return replica
+def _compiled(function: Callable[..., Values]) -> Callable[..., Values]:
+    from torch import _dynamo as dynamo  # takes a second to import
+
+    # One code object is compiled anew for every learner of the process.
+    dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, 256)
+    compiled: Callable[..., Values] = torch.compile(function, fullgraph=True, dynamic=False)
+    return compiled

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from switchmt_snn.config import LearningConfig
-from switchmt_snn.learning.engine import divided, q_function
+from switchmt_snn.learning.engine import make_evaluate
 from switchmt_snn.learning.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.state import Stateful
@@ -51,7 +51,7 @@ class Learner(Stateful):
     """
 
     SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
-    DERIVED = ("config", "device", "_online_q", "_target_q", "_training_q", "_group", "_invalid_KA")
+    DERIVED = ("config", "device", "_evaluate", "_group", "_invalid_KA")
 
     def __init__(
         self,
@@ -77,10 +77,8 @@ class Learner(Stateful):
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
         precision = torch.bfloat16 if config.precision == "bfloat16" else None
-        self._online_q = q_function(self.network, config.engine, precision)
-        self._target_q = q_function(self.target, config.engine, precision)
         self._group = group
-        self._training_q = self._online_q if group is None else divided(self.network, self._online_q, group)
+        self._evaluate = make_evaluate(self.network, self.target, config.engine, precision, config.double_q, group)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon, fused=True
         )
@@ -107,21 +105,15 @@ class Learner(Stateful):
         self._gradient_step(batch, task)
 
     def _gradient_step(self, batch: Batch, task: int) -> None:
-        config, generator = self.config, self.generator
+        config = self.config
         observations, next_observations = self._tensor(batch.observations), self._tensor(batch.next_observations)
         rewards_B = self._tensor(batch.rewards)
         if config.clip_rewards:
             rewards_B = rewards_B.clamp(-1.0, 1.0)
+        q_BA, q_next_BA, q_choice_BA = self._evaluate(observations, next_observations, task, self.generator)
         with torch.no_grad():
-            q_next_BA = self._target_q(next_observations, task, generator)
-            q_choice_BA = q_next_BA
-            if config.double_q:
-                self.network.eval()
-                q_choice_BA = self._online_q(next_observations, task, generator)
             q_choice_BA = q_choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
             target_B = td_target(rewards_B, self._tensor(batch.terminated), q_next_BA, q_choice_BA, config.discount)
-        self.network.train()
-        q_BA = self._training_q(observations, task, generator)
         q_B = q_BA.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
         loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
         self.optimizer.zero_grad(set_to_none=True)

@@ -103,11 +103,11 @@ class TrunkLayer(nn.Module):
         """The running mean and variance ``[C]`` of a task, as views; nothing without normalisation."""
         return () if self.normalization is None else self.normalization.statistics(task)
 
-    def current(self, x: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None = None) -> Tensor:
+    def current(self, x: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None, training: bool) -> Tensor:
         """Input currents ``[T, B, ...]`` of the neurons for inputs ``[T, B, ...]``, time folded into the batch."""
         y = synaptic_products(self.synapses, x.flatten(0, 1), precision)
         if self.normalization is not None:
-            y = self.normalization.normalize(y, *context)
+            y = self.normalization.normalize(y, context, training)
         return cast(Tensor, y.unflatten(0, x.shape[:2]))
 
 
@@ -240,11 +240,16 @@ class QNetwork(nn.Module):
         state: State | None = None,
         activity: dict[str, Tensor] | None = None,
         precision: torch.dtype | None = None,
+        training: bool | None = None,
     ) -> Tensor:
-        """Q-values ``[B, A]`` of encoded inputs ``[T, B, ...]`` in a task's context; the rest as in :meth:`forward`."""
+        """Q-values ``[B, A]`` of encoded inputs ``[T, B, ...]`` in a task's context; the rest as in :meth:`forward`.
+
+        ``training`` normalises by the batch or by the running statistics; None does as the module's mode says.
+        """
+        training = self.training if training is None else training
         state = {} if state is None else state
         for name, layer in self.trunk.items():
-            current = self._over_time(cast(TrunkLayer, layer).current(x, context[name], precision))
+            current = self._over_time(cast(TrunkLayer, layer).current(x, context[name], precision, training))
             x = self._fire(name, cast(TrunkLayer, layer), current, state, activity)
         features_TBN = x.flatten(2)
         outputs = {

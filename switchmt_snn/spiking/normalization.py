@@ -37,13 +37,14 @@ class TaskBatchNorm(nn.Module):
     def forward(self, x: Tensor, task: int) -> Tensor:
         """Normalise by the batch in training mode (and move the task's running statistics), by the task's running
         statistics in eval mode."""
-        return self.normalize(x, *self.statistics(task))
+        return self.normalize(x, self.statistics(task), self.training)
 
-    def normalize(self, x: Tensor, mean_C: Tensor, var_C: Tensor) -> Tensor:
-        """As :meth:`forward`, with a task's running statistics handed in (moved in place in training mode)."""
-        if self.training and self.sum_over_processes is not None:
+    def normalize(self, x: Tensor, statistics: tuple[Tensor, ...], training: bool) -> Tensor:
+        """As :meth:`forward`, with a task's running mean and variance ``[C]`` and the mode handed in."""
+        mean_C, var_C = statistics
+        if training and self.sum_over_processes is not None:
             return self._normalize_over_processes(x, mean_C, var_C, self.sum_over_processes)
-        return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, self.training, self.momentum, self.epsilon)
+        return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, training, self.momentum, self.epsilon)
 
     def _normalize_over_processes(
         self, x: Tensor, mean_C: Tensor, var_C: Tensor, total: Callable[[Tensor], Tensor]
