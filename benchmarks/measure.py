@@ -40,15 +40,24 @@ def matmul_gflops(dtype: torch.dtype, device: str = "cpu", size: int = 2048) -> 
     return 2.0 * size**3 / times_ms(product, 10, warmup=2)["min_ms"] / 1e6
 
 
-def interleaved_ms(actions: dict[str, Callable[[], object]], repeats: int, warmup: int = 2) -> dict[str, list[float]]:
-    """Times of every action in milliseconds; each round runs each once, so that a slow moment hits all of them."""
+def interleaved_ms(
+    actions: dict[str, Callable[[], object]], repeats: int, warmup: int = 2, calls: int = 1
+) -> dict[str, list[float]]:
+    """Times of every action in milliseconds.
+
+    Each round runs each action, so that a slow moment of the machine hits all of them. With ``calls`` above 1 a round
+    calls it so often, after one call that is not counted: threads of the action before it may still be spinning.
+    """
     times: dict[str, list[float]] = {name: [] for name in actions}
     for round_ in range(repeats + warmup):
         for name, action in actions.items():
-            started = time.perf_counter()
-            action()
-            if round_ >= warmup:
-                times[name].append((time.perf_counter() - started) * 1e3)
+            if calls > 1:
+                action()
+            for _ in range(calls):
+                started = time.perf_counter()
+                action()
+                if round_ >= warmup:
+                    times[name].append((time.perf_counter() - started) * 1e3)
     return times
 
 

@@ -15,10 +15,12 @@ import numpy as np
 import torch
 
 from benchmarks.measure import environment, times_ms
+from benchmarks.peers import StackReplay
 from switchmt_snn import config_io
 from switchmt_snn.config import resolve
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.machine import keep_freed_memory
 from switchmt_snn.learning.replay import FrameReplay
 from switchmt_snn.learning.run import load_agent
 from switchmt_snn.learning.training import observation_spec
@@ -29,6 +31,14 @@ from switchmt_snn.tasks.suite import TaskSuite
 
 ENVS = 4
 EPSILON = 0.05
+STACKED_STEPS = 10_000
+"""Transitions that the memories of whole stacks hold; 0.5 GiB."""
+LAYOUTS = {
+    "compressed": "ours, compressed",
+    "plain": "ours, plain (frames once)",
+    "stacks, one": "stacks once (SB3, optimize_memory_usage)",
+    "stacks, both": "both stacks (SB3, CleanRL)",
+}
 
 
 def record(suite: TaskSuite, task: int, agent: Agent | None, steps: int) -> tuple[list[tuple[Any, ...]], float]:
@@ -70,6 +80,26 @@ def fill(replay: FrameReplay, events: list[tuple[Any, ...]]) -> float:
     return (time.perf_counter() - started) / sum(kind == "add" for kind, *_ in events)
 
 
+def fill_stacks(replay: StackReplay, events: list[tuple[Any, ...]], shape: tuple[int, ...]) -> float:
+    """Seconds per added transition of a memory of whole stacks; making the stacks is not counted."""
+    stacks: dict[int, Any] = {}
+    spent = 0.0
+    for kind, lane, *rest in events:
+        if kind == "begin":
+            stacks[lane] = np.zeros(shape, np.uint8)
+            stacks[lane][-1:] = rest[0]
+            continue
+        action, reward, done, frame = rest
+        following = np.concatenate([stacks[lane][1:], frame])
+        started = time.perf_counter()
+        replay.add(stacks[lane], action, reward, done, following)
+        spent += time.perf_counter() - started
+        stacks[lane] = following
+        if replay.held == len(replay.actions):
+            break
+    return spent / replay.held
+
+
 def measure(run: str | None, steps: int, repeats: int) -> dict[str, Any]:
     """Every game of the run, or of the quickstart."""
     agent = load_agent(run, device="cpu") if run is not None else None
@@ -95,6 +125,15 @@ def measure(run: str | None, steps: int, repeats: int) -> dict[str, Any]:
                 for batch_size, count in ((32, repeats), (512, 2)):
                     batch = replay.sample(batch_size, rng)
                     game[f"update_{batch_size}"] = times_ms(partial(learner.update, batch, task), count)
+        for kind, twice in (("stacks, both", True), ("stacks, one", False)):
+            stacked = StackReplay(STACKED_STEPS, suite.observation_shape, twice)
+            add_s = fill_stacks(stacked, events, suite.observation_shape)
+            rng = np.random.default_rng(0)
+            game[kind] = {
+                "bytes_per_transition": stacked.nbytes / stacked.held,
+                "add_us": add_s * 1e6,
+                **{f"sample_{b}": times_ms(partial(stacked.sample, b, rng), repeats) for b in (32, 512)},
+            }
         games[name] = game
     observation = int(np.prod(suite.observation_shape)) * np.dtype(suite.frame_dtype).itemsize
     return {
@@ -121,23 +160,25 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    keep_freed_memory()  # as `train` does
     result = measure(options.run, options.steps, options.repeats)
     if options.json:
         print(json.dumps(result, indent=1))
         return
     print(f"policy: {result['policy']}; {result['steps_per_game']:,} steps per game")
     print(
-        f"{'game':12}{'plain B':>9}{'zstd B':>8}{'add us':>8}{'env us':>8}{'B=32 ms':>9}{'of update':>10}"
-        f"{'B=512 ms':>10}{'of update':>10}"
+        f"{'game':10}{'layout':42}{'bytes':>8}{'add us':>8}{'of step':>9}"
+        f"{'B=32 ms':>9}{'of update':>10}{'B=512 ms':>10}{'of update':>10}"
     )
     for name, game in result["games"].items():
-        small, large = (game["compressed"][f"sample_{b}"]["median_ms"] for b in (32, 512))
-        shares = [s / game[f"update_{b}"]["median_ms"] for s, b in ((small, 32), (large, 512))]
-        print(
-            f"{name:12}{game['plain']['bytes_per_transition']:9,.0f}{game['compressed']['bytes_per_transition']:8,.0f}"
-            f"{game['compressed']['add_us']:8.1f}{game['env_step_us']:8.0f}{small:9.2f}{shares[0]:10.1%}"
-            f"{large:10.1f}{shares[1]:10.1%}"
-        )
+        for kind, label in LAYOUTS.items():
+            row = game[kind]
+            small, large = (row[f"sample_{b}"]["median_ms"] for b in (32, 512))
+            shares = [s / game[f"update_{b}"]["median_ms"] for s, b in ((small, 32), (large, 512))]
+            print(
+                f"{name:10}{label:42}{row['bytes_per_transition']:8,.0f}{row['add_us']:8.1f}"
+                f"{row['add_us'] / game['env_step_us']:9.1%}{small:9.2f}{shares[0]:10.1%}{large:10.1f}{shares[1]:10.1%}"
+            )
     print(f"mean: {result['mean_bytes_per_transition']:.0f} bytes per transition")
 
 

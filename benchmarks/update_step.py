@@ -16,122 +16,61 @@ import importlib.util
 import json
 import statistics
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-import snntorch
 import torch
 import torch.nn.functional as F
-from snntorch import surrogate
 from torch import Tensor, nn
 
 from benchmarks.measure import environment, interleaved_ms, matmul_gflops, summary
+from benchmarks.peers import ACTIONS, PlainLoop, spikingjelly_network
 from switchmt_snn import config_io
 from switchmt_snn.config import ExperimentConfig, resolve
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.machine import keep_freed_memory
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
-ACTIONS = 18
 PLAIN = "plain loop over snn.Leaky"
 
 
-class PlainLoop(nn.Module):
-    """How snnTorch's tutorials write it: every layer at every step, ``snn.Leaky`` with its own state, Q from the mean
-    of the heads' outputs."""
+class PeerUpdate:
+    """The same double-DQN step around somebody else's network; call it for one step on the batch that it holds."""
 
-    def __init__(self, timesteps: int) -> None:
-        super().__init__()
-        self.timesteps = timesteps
-        self.convolutions = nn.ModuleList([nn.Conv2d(4, 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)])
-        self.norms = nn.ModuleList([nn.BatchNorm2d(32), nn.BatchNorm2d(64), nn.BatchNorm2d(64)])
-        self.hidden = nn.ModuleList([nn.Linear(3136, 512), nn.Linear(3136, 512)])
-        self.gains = nn.ParameterList([nn.Parameter(torch.zeros(3)) for _ in range(2)])
-        self.heads = nn.ModuleList([nn.Linear(512, 1), nn.Linear(512, ACTIONS)])
-        leaky = {"beta": 1.0, "spike_grad": surrogate.atan(), "reset_mechanism": "zero", "reset_delay": True}
-        self.leaky = nn.ModuleList([snntorch.Leaky(**leaky) for _ in range(5)])
+    def __init__(self, network: nn.Module, batch: Batch, bf16: bool, device: str) -> None:
+        self.network = network.to(device)
+        self.target = copy.deepcopy(self.network).eval()
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=1e-4, fused=True)
+        self.bf16, self.device = bf16, device
+        self.load(batch)
 
-    def forward(self, x: Tensor) -> Tensor:
-        membranes = [neuron.init_leaky() for neuron in self.leaky]  # type: ignore[operator]
-        total: Tensor | float = 0.0
-        for _ in range(self.timesteps):
-            s = x
-            for i, (convolution, norm) in enumerate(zip(self.convolutions, self.norms, strict=True)):
-                s, membranes[i] = self.leaky[i](norm(convolution(s)), membranes[i])
-            flat, outputs = s.flatten(1), []
-            for j in range(2):
-                gated = self.hidden[j](flat) * torch.sigmoid(self.gains[j].max())
-                spikes, membranes[3 + j] = self.leaky[3 + j](gated, membranes[3 + j])
-                outputs.append(self.heads[j](spikes))
-            value, advantage = outputs
-            total = total + value + advantage - advantage.mean(1, keepdim=True)
-        return total / self.timesteps  # type: ignore[return-value]
+    def load(self, batch: Batch) -> None:
+        """Take the next batch."""
+        tensors = (torch.from_numpy(getattr(batch, field.name)).to(self.device) for field in fields(Batch))
+        x, actions, self.rewards, x_next, self.terminated = tensors
+        self.x, self.x_next, self.actions = x.float() / 255, x_next.float() / 255, actions[:, None]
 
-
-def spikingjelly_network(timesteps: int) -> nn.Module:
-    """SpikingJelly's multi-step mode: stateless layers see time folded, neurons walk over it."""
-    from spikingjelly.activation_based import functional, layer, neuron
-    from spikingjelly.activation_based import surrogate as sj_surrogate
-
-    class MultiStep(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-
-            def fires() -> nn.Module:
-                return neuron.IFNode(  # type: ignore[no-any-return]
-                    v_reset=0.0, surrogate_function=sj_surrogate.ATan(), detach_reset=True, step_mode="m"
-                )
-
-            convolutions = []
-            for before, after, kernel, stride in ((4, 32, 8, 4), (32, 64, 4, 2), (64, 64, 3, 1)):
-                convolutions += [layer.Conv2d(before, after, kernel, stride), layer.BatchNorm2d(after), fires()]
-            self.trunk = nn.Sequential(*convolutions, layer.Flatten())
-            self.hidden = nn.ModuleList([layer.Linear(3136, 512) for _ in range(2)])
-            self.gains = nn.ParameterList([nn.Parameter(torch.zeros(3)) for _ in range(2)])
-            self.fires = nn.ModuleList([fires() for _ in range(2)])
-            self.heads = nn.ModuleList([layer.Linear(512, n) for n in (1, ACTIONS)])
-            functional.set_step_mode(self, "m")
-
-        def forward(self, x: Tensor) -> Tensor:
-            functional.reset_net(self)
-            features = self.trunk(x.expand(timesteps, *x.shape))
-            value, advantage = (
-                self.heads[j](self.fires[j](self.hidden[j](features) * torch.sigmoid(self.gains[j].max()))).mean(0)
-                for j in range(2)
-            )
-            return value + advantage - advantage.mean(1, keepdim=True)  # type: ignore[no-any-return]
-
-    return MultiStep()
-
-
-def peer_update(network: nn.Module, batch: Batch, bf16: bool, device: str) -> Callable[[], None]:
-    """The same double-DQN step around somebody else's network."""
-    network = network.to(device)
-    target = copy.deepcopy(network).eval()
-    optimizer = torch.optim.Adam(network.parameters(), lr=1e-4, fused=True)
-    x, x_next = (torch.from_numpy(o).to(device).float() / 255 for o in (batch.observations, batch.next_observations))
-    actions, rewards = torch.from_numpy(batch.actions).to(device)[:, None], torch.from_numpy(batch.rewards).to(device)
-
-    def q(module: nn.Module, inputs: Tensor) -> Tensor:
-        with torch.autocast(device, torch.bfloat16, enabled=bf16):
+    def q(self, module: nn.Module, inputs: Tensor) -> Tensor:
+        """Q-values, under autocast if asked for."""
+        with torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
             return module(inputs).float()  # type: ignore[no-any-return]
 
-    def step() -> None:
+    def __call__(self) -> None:
         with torch.no_grad():
-            network.eval()
-            chosen = q(network, x_next).argmax(1, keepdim=True)
-            goal = rewards + 0.99 * q(target, x_next).gather(1, chosen).squeeze(1)
-        network.train()
-        loss = F.mse_loss(q(network, x).gather(1, actions).squeeze(1), goal)
-        optimizer.zero_grad(set_to_none=True)
+            self.network.eval()
+            chosen = self.q(self.network, self.x_next).argmax(1, keepdim=True)
+            value = self.q(self.target, self.x_next).gather(1, chosen).squeeze(1)
+            goal = self.rewards + 0.99 * value * ~self.terminated
+        self.network.train()
+        loss = F.mse_loss(self.q(self.network, self.x).gather(1, self.actions).squeeze(1), goal)
+        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        optimizer.step()
-
-    return step
+        self.optimizer.step()
 
 
 def our_learner(config: ExperimentConfig, suite: TaskSuite, device: str) -> Learner:
@@ -167,13 +106,13 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
     batch = Batch(frames[0], rng.integers(0, ACTIONS, batch_size), rewards, frames[1], np.zeros(batch_size, np.bool_))
     torch.manual_seed(0)
     gflops = {name: matmul_gflops(getattr(torch, name), device) for name in ("float32", "bfloat16")}
-    steps: dict[str, Callable[[], None]] = {PLAIN: peer_update(PlainLoop(timesteps), batch, False, device)}
+    steps: dict[str, Callable[[], None]] = {PLAIN: PeerUpdate(PlainLoop(timesteps), batch, False, device)}
     limits, precisions = {}, {PLAIN: "float32"}
     if importlib.util.find_spec("spikingjelly"):
         network = spikingjelly_network(timesteps)
         for precision in gflops:
             name = f"SpikingJelly multi-step, {precision}"
-            steps[name] = peer_update(copy.deepcopy(network), batch, precision == "bfloat16", device)
+            steps[name] = PeerUpdate(copy.deepcopy(network), batch, precision == "bfloat16", device)
             precisions[name] = precision
     work = {}
     for method, label in (("SwitchMT", "ours"), ("DQN_D", "our ANN of the same shape")):
@@ -226,6 +165,7 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    keep_freed_memory()  # as `train` does
     result = measure(options.batch, options.timesteps, options.repeats, options.device)
     if options.json:
         print(json.dumps(result, indent=1))

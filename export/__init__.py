@@ -7,7 +7,7 @@ while it plays, prices it, and writes a report.
 
 from switchmt_snn.export.api import check_parity, to_nir, to_onnx
 from switchmt_snn.export.profiling import Profile, compare_profiles, profile, profile_file
-from switchmt_snn.export.run import ExportResult, ExportSettings, evaluate_engine, export
+from switchmt_snn.export.run import ExportResult, ExportSettings, evaluate_engine, export, load_exported
 
 __all__ = [
     "ExportResult",
@@ -17,6 +17,7 @@ __all__ = [
     "compare_profiles",
     "evaluate_engine",
     "export",
+    "load_exported",
     "profile",
     "profile_file",
     "to_nir",

@@ -27,8 +27,8 @@ from switchmt_snn.tasks.suite import TaskSuite
 Observations = npt.NDArray[Any]
 
 
-def onnx_session(model: Path | bytes) -> onnxruntime.InferenceSession:
-    """A session on one thread, so that sums have one order.
+def onnx_session(model: Path | bytes, threads: int = 1) -> onnxruntime.InferenceSession:
+    """A session; on one thread sums have one order.
 
     Raises:
         ExportError: not an ONNX file, or one that refers to other files (external data).
@@ -39,7 +39,7 @@ def onnx_session(model: Path | bytes) -> onnxruntime.InferenceSession:
         if external:
             raise ExportError(f"{model!s:.80} keeps weights in other files ({external[0]}), expected one whole file")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
         return onnxruntime.InferenceSession(proto.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
@@ -94,8 +94,16 @@ class OnnxAgent:
         step: training step of the weights, from the file.
     """
 
-    def __init__(self, model: Path | bytes, suite: TaskSuite, config: ExperimentConfig) -> None:
-        self.session = onnx_session(model)
+    def __init__(self, model: Path | bytes, suite: TaskSuite, config: ExperimentConfig, threads: int = 1) -> None:
+        """Open a model.
+
+        Args:
+            model: file or bytes.
+            suite: tasks of the run that it came from.
+            config: of that run.
+            threads: of onnxruntime; with more than one a single decision is faster.
+        """
+        self.session = onnx_session(model, threads)
         self.suite, self.config = suite, config
         self.step = int(json.loads(self.session.get_modelmeta().custom_metadata_map["training_step"]))
         self._inputs = [value.name for value in self.session.get_inputs()]

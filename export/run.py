@@ -12,6 +12,7 @@ from typing import Any
 import numpy.typing as npt
 import onnx
 
+from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
 from switchmt_snn.export.engines import ComparedAgent, NirAgent, OnnxAgent, read_nir
 from switchmt_snn.export.fold import FoldedNetwork, fold, metadata, quantized
@@ -25,6 +26,8 @@ from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, eva
 from switchmt_snn.learning.files import write_atomically
 from switchmt_snn.learning.run import load_agent
 from switchmt_snn.learning.run_folder import RunFolder, latest_run
+from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.suite import TaskSuite
 
 Note = Callable[[str], None]
 
@@ -205,12 +208,7 @@ def evaluate_engine(
     folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(folder.path, checkpoint, "cpu")
     suite, config = agent.suite, agent.config
-    played: OnnxAgent | NirAgent
-    if engine == "onnx":
-        played = OnnxAgent(_exported(folder, "decision.onnx", "--onnx"), suite, config)
-    else:
-        paths = {name: _exported(folder, f"{file_name(name)}.nir", "--nir") for name in suite.names}
-        played = NirAgent({name: read_nir(path) for name, path in paths.items()}, suite, config)
+    played = _engine(folder, engine, suite, config)
     if played.step != agent.step:
         raise ExportError(
             f"the exported files are of step {played.step}, expected {agent.step} (the {checkpoint} checkpoint); "
@@ -225,6 +223,31 @@ def evaluate_engine(
     facts = {"engine": engine, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
     write_atomically(folder.path / "export" / f"evaluation_{engine}.json", json.dumps(facts, indent=1).encode())
     return evaluation, share
+
+
+def load_exported(run: str | Path | None = None, engine: str = "onnx", threads: int = 1) -> OnnxAgent | NirAgent:
+    """A run's exported files as an agent: ``q_values(observations, task)`` for raw observations ``[B, ...]``.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        engine: ``onnx``, the fastest way to act on a CPU (docs/performance.md), or ``nir``.
+        threads: of onnxruntime. With more than one a decision is faster, and sums may have another order.
+
+    Raises:
+        ExportError: the run was not exported.
+    """
+    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    config = folder.config()
+    return _engine(folder, engine, make_suite(config.tasks), config, threads)
+
+
+def _engine(
+    folder: RunFolder, engine: str, suite: TaskSuite, config: ExperimentConfig, threads: int = 1
+) -> OnnxAgent | NirAgent:
+    if engine == "onnx":
+        return OnnxAgent(_exported(folder, "decision.onnx", "--onnx"), suite, config, threads)
+    paths = {name: _exported(folder, f"{file_name(name)}.nir", "--nir") for name in suite.names}
+    return NirAgent({name: read_nir(path) for name, path in paths.items()}, suite, config)
 
 
 def _exported(folder: RunFolder, name: str, flag: str) -> Path:

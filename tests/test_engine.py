@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -133,6 +136,20 @@ def test_bfloat16_instructions_are_those_that_the_system_lists() -> None:
         pytest.skip("no /proc/cpuinfo")
     flags = listing.read_text()
     assert machine.has_bfloat16(CPU) == ("avx512_bf16" in flags or "amx_tile" in flags)
+
+
+def test_freed_memory_is_kept_where_the_c_library_can() -> None:
+    """In a process of its own, whose next large allocation takes no new pages."""
+    code = (
+        "import resource, torch\nfrom switchmt_snn.learning.machine import keep_freed_memory\n"
+        "kept = keep_freed_memory()\ntorch.ones(50_000_000)\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\ntorch.ones(50_000_000)\n"
+        "print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert (out[0] == "True") == (platform.libc_ver()[0] == "glibc")
+    if out[0] == "True":
+        assert int(out[1]) < 1_000  # of the 48,829 pages of 4 KiB
 
 
 def test_spikes_are_the_same_in_both_engines_where_sums_are_exact() -> None:

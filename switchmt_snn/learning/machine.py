@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import replace
 
 import torch
@@ -122,6 +123,23 @@ def compile_problem() -> str | None:
     except Exception as error:
         return str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
     return None
+
+
+def keep_freed_memory() -> bool:
+    """Let the C library keep what is freed instead of handing it back to the system at once.
+
+    Activations of a large batch are allocated and freed at every update, and fresh pages cost more than the arithmetic
+    that is done on them (docs/performance.md, Scaling). No number changes, and a process keeps its peak.
+
+    Returns:
+        whether the C library (glibc) can be told so.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    trim_threshold, mmap_threshold = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
+    return bool(mallopt(mmap_threshold, 2**30)) and bool(mallopt(trim_threshold, 2**31 - 1))
 
 
 def _processor_of(device: torch.device) -> str:

@@ -21,7 +21,7 @@ from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.description import describe_method
 from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.learning.events import Event, Stepped
-from switchmt_snn.learning.machine import select_device, settle
+from switchmt_snn.learning.machine import keep_freed_memory, select_device, settle
 from switchmt_snn.learning.memory import require_memory
 from switchmt_snn.learning.processes import ProcessGroup, join_processes
 from switchmt_snn.learning.replay import Batch
@@ -120,6 +120,7 @@ def _train(
     torch.backends.cudnn.deterministic = True  # exact resume; benchmark mode would choose kernels by the clock
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    keep_freed_memory()
     require_memory(describe_method(config, suite).memory, config)
     lock = folder.lock()
     try:

@@ -1,0 +1,88 @@
+"""Decisions: our network and its ONNX export against the plain loop, interleaved in one process.
+
+``python -m benchmarks.acting [--repeats 12] [--json]``. An untrained network of the quickstart preset; every engine
+uses all cores and is called ten times in turn. One decision is what a robot asks for, eight what an evaluation does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.measure import environment, interleaved_ms, summary
+from benchmarks.peers import PlainLoop
+from switchmt_snn import config_io
+from switchmt_snn.config import resolve
+from switchmt_snn.export import to_onnx
+from switchmt_snn.export.engines import OnnxAgent
+from switchmt_snn.learning.agent import Agent
+from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.spiking.network import build_network
+from switchmt_snn.tasks.make import make_suite
+
+BATCHES = (1, 8)
+PLAIN = "plain loop over snn.Leaky"
+
+
+def engines() -> dict[str, Callable[[Any], object]]:
+    """Observations ``[B, 4, 84, 84]`` to Q-values, by name; the first is the one that ratios refer to."""
+    config = resolve(config_io.load_config("quickstart"))
+    suite = make_suite(config.tasks)
+    agent = Agent(build_network(config.network, observation_spec(suite), 1), suite, config, torch.device("cpu"), 0)
+    exported = OnnxAgent(to_onnx(agent).SerializeToString(), suite, config, threads=torch.get_num_threads())
+    plain = PlainLoop(config.network.timesteps).eval()
+
+    def plain_loop(observations: Any) -> object:
+        with torch.inference_mode():
+            return plain(torch.from_numpy(observations).float() / 255).numpy()
+
+    return {
+        PLAIN: plain_loop,
+        "ours, PyTorch": lambda observations: agent.q_values(observations, 0),
+        "ours, ONNX in onnxruntime": lambda observations: exported.q_values(observations, 0),
+    }
+
+
+def measure(repeats: int) -> dict[str, Any]:
+    """Times per call by batch and engine."""
+    rng, batches = np.random.default_rng(0), {}
+    named = engines()
+    for size in BATCHES:
+        observations = rng.integers(0, 256, (size, 4, 84, 84), np.uint8)
+        calls = {name: lambda act=act, x=observations: act(x) for name, act in named.items()}  # type: ignore[misc]
+        times = interleaved_ms(calls, repeats, calls=10)
+        slowest = statistics.median(times[PLAIN])
+        batches[str(size)] = {
+            name: {**summary(values), "faster_than_plain_loop": slowest / statistics.median(values)}
+            for name, values in times.items()
+        }
+    return {"repeats": repeats, "batches": batches, "environment": environment()}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=12)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    result = measure(options.repeats)
+    if options.json:
+        print(json.dumps(result, indent=1))
+        return
+    print(f"{'decisions':>9} {'engine':32}{'median ms':>10}{'min':>8}{'max':>8}{'x plain':>9}")
+    for size, rows in result["batches"].items():
+        for name, row in rows.items():
+            print(
+                f"{size:>9} {name:32}{row['median_ms']:10.2f}{row['min_ms']:8.2f}{row['max_ms']:8.2f}"
+                f"{row['faster_than_plain_loop']:9.2f}"
+            )
+
+
+if __name__ == "__main__":
+    main()
