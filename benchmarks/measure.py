@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import Any
 
 import torch
+from torch import nn
 
 from switchmt_snn.learning.run_folder import processor
 
@@ -38,6 +39,27 @@ def matmul_gflops(dtype: torch.dtype, device: str = "cpu", size: int = 2048) -> 
             torch.cuda.synchronize()
 
     return 2.0 * size**3 / times_ms(product, 10, warmup=2)["min_ms"] / 1e6
+
+
+def read_gigabytes_per_s(megabytes: int = 256) -> float:
+    """The machine's ceiling for reading: the fastest of some sums over a large array."""
+    array = torch.ones(megabytes * 2**18)
+    return array.numel() * 4 / times_ms(array.sum, 10, warmup=2)["min_ms"] / 1e6
+
+
+def network_macs(network: nn.Module, forward: Callable[[], object]) -> dict[nn.Module, float]:
+    """Multiply-accumulates of every convolution and linear layer in one call of ``forward``, in forward order."""
+    macs: dict[nn.Module, float] = {}
+
+    def count(module: nn.Module, inputs: Any, output: torch.Tensor) -> None:
+        macs[module] = float(output.numel() * module.weight[0].numel())  # type: ignore[index, operator, union-attr]
+
+    layers = [module for module in network.modules() if isinstance(module, (nn.Conv2d, nn.Linear))]
+    hooks = [module.register_forward_hook(count) for module in layers]
+    forward()
+    for hook in hooks:
+        hook.remove()
+    return macs
 
 
 def interleaved_ms(

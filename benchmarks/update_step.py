@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from benchmarks.measure import environment, interleaved_ms, matmul_gflops, summary
+from benchmarks.measure import environment, interleaved_ms, matmul_gflops, network_macs, summary
 from benchmarks.peers import ACTIONS, PlainLoop, spikingjelly_network
 from switchmt_snn import config_io
 from switchmt_snn.config import ExperimentConfig, resolve
@@ -82,16 +82,7 @@ def our_learner(config: ExperimentConfig, suite: TaskSuite, device: str) -> Lear
 
 def update_gigaoperations(learner: Learner, batch: Batch) -> float:
     """Operations of an update's products in 1e9, two for a multiply-accumulate."""
-    macs: dict[nn.Module, float] = {}
-
-    def count(module: nn.Module, inputs: Any, output: Tensor) -> None:
-        macs[module] = float(output.numel() * module.weight[0].numel())  # type: ignore[index, operator, union-attr]
-
-    layers = [module for module in learner.network.modules() if isinstance(module, (nn.Conv2d, nn.Linear))]
-    hooks = [module.register_forward_hook(count) for module in layers]
-    learner.act(batch.observations, 0)
-    for hook in hooks:
-        hook.remove()
+    macs = network_macs(learner.network, lambda: learner.act(batch.observations, 0))
     forward, first = sum(macs.values()), next(iter(macs.values()))
     return 2e-9 * (3 * forward + 2 * forward - first)  # no gradient for the observations
 

@@ -10,7 +10,7 @@ import torch
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError
 
-COMPILE_FROM_UPDATES = 50_000
+COMPILE_FROM_UPDATES = 150_000
 """``engine=auto`` compiles runs of at least this many updates: a minute at the start, minutes to hours back."""
 
 
