@@ -156,6 +156,8 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device is cuda, expected a machine with a CUDA device and a torch built for it; use cpu")
     keep_freed_memory()  # as `train` does
     result = measure(options.batch, options.timesteps, options.repeats, options.device)
     if options.json:
