@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from benchmarks.environments import wrapped_game
-from benchmarks.measure import environment
+from benchmarks.measure import environment, rates
 from benchmarks.peers import ACTIONS, PlainLoop
 from benchmarks.update_step import PeerUpdate
 from switchmt_snn import config_io
@@ -108,7 +108,7 @@ def measure(steps: int, rounds: int) -> dict[str, Any]:
     for name, learning in OURS.items():
         makers[name] = lambda learning=learning: our_loop(total, **learning)  # type: ignore[misc]
     loops = {name: make() for name, make in makers.items()}
-    rates: dict[str, list[float]] = {name: [] for name in loops}
+    measured: dict[str, list[float]] = {name: [] for name in loops}
     for loop in loops.values():
         for _ in range(WARM_UP + 40):
             next(loop)
@@ -117,16 +117,11 @@ def measure(steps: int, rounds: int) -> dict[str, Any]:
             started = time.perf_counter()
             for _ in range(steps):
                 next(loop)
-            rates[name].append(steps / (time.perf_counter() - started))
-    slowest = statistics.median(rates[PLAIN])
+            measured[name].append(steps / (time.perf_counter() - started))
+    slowest = statistics.median(measured[PLAIN])
     rows = {
-        name: {
-            "median_per_s": statistics.median(values),
-            "min_per_s": min(values),
-            "max_per_s": max(values),
-            "faster_than_plain_loop": statistics.median(values) / slowest,
-        }
-        for name, values in rates.items()
+        name: {**rates(values), "faster_than_plain_loop": statistics.median(values) / slowest}
+        for name, values in measured.items()
     }
     return {"steps": steps, "rounds": rounds, "variants": rows, "environment": environment()}
 

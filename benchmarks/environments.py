@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import time
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +18,7 @@ import gymnasium
 import numpy as np
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
-from benchmarks.measure import environment
+from benchmarks.measure import environment, rates
 from switchmt_snn import config_io
 from switchmt_snn.config import resolve
 from switchmt_snn.tasks.make import make_suite
@@ -66,19 +65,16 @@ def measure(steps: int) -> dict[str, Any]:
         plays = [Play(suite, task, copies) for copies in COPIES]
         for play in plays:
             runners[f"ours, {play.num_envs} copies"] = partial(our_steps, play, rng)
-        rates: dict[str, list[float]] = {key: [] for key in runners}
+        measured: dict[str, list[float]] = {key: [] for key in runners}
         for _ in range(ROUNDS):
             for key, runner in runners.items():
                 started = time.perf_counter()
                 runner(steps)
-                rates[key].append(steps / (time.perf_counter() - started))
+                measured[key].append(steps / (time.perf_counter() - started))
         for play in plays:
             play.close()
         env.close()
-        games[name] = {
-            key: {"median_per_s": statistics.median(values), "min_per_s": min(values), "max_per_s": max(values)}
-            for key, values in rates.items()
-        }
+        games[name] = {key: rates(values) for key, values in measured.items()}
     return {"steps": steps, "rounds": ROUNDS, "games": games, "environment": environment()}
 
 

@@ -88,6 +88,11 @@ def summary(values: list[float]) -> dict[str, float]:
     return {"median_ms": statistics.median(values), "min_ms": min(values), "max_ms": max(values)}
 
 
+def rates(values: list[float]) -> dict[str, float]:
+    """Median and spread of rates per second."""
+    return {"median_per_s": statistics.median(values), "min_per_s": min(values), "max_per_s": max(values)}
+
+
 def environment() -> dict[str, Any]:
     """Machine and versions."""
     return {

@@ -1,9 +1,10 @@
 """How an update's three forward passes are run: operation by operation, compiled, or divided among processes.
 
 Compiled code computes the same function with other roundings (a test compares the two). A membrane that lies within
-rounding of the threshold may fire in one and not in the other, as between any two orders of a sum. One compilation serves all
-tasks, because a task enters as tensors (:meth:`QNetwork.context`), and all steps, because an update's batch has one
-size. It is never given up midway: what cannot be compiled as a whole raises.
+rounding of the threshold may fire in one and not in the other, as between any two orders of a sum.
+
+One compilation serves all tasks, because a task enters as tensors (:meth:`QNetwork.context`), and all steps, because an
+update's batch has one size. It is never given up midway: what cannot be compiled as a whole raises.
 """
 
 from __future__ import annotations
