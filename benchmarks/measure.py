@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,7 +19,7 @@ from switchmt_snn.learning.run_folder import processor
 PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "ale-py", "zstandard", "onnxruntime")
 
 
-def times_ms(action: Callable[[], object], repeats: int, warmup: int = 1) -> dict[str, float]:
+def times_ms(action: Callable[[], object], repeats: int, warmup: int = 1) -> dict[str, Any]:
     """Median, smallest and largest of single calls in milliseconds."""
     for _ in range(warmup):
         action()
@@ -83,19 +85,22 @@ def interleaved_ms(
     return times
 
 
-def summary(values: list[float]) -> dict[str, float]:
-    """Median and spread of times in milliseconds."""
-    return {"median_ms": statistics.median(values), "min_ms": min(values), "max_ms": max(values)}
+def summary(values: list[float]) -> dict[str, Any]:
+    """Median and spread of times in milliseconds, and the times."""
+    raw = [round(value, 4) for value in values]
+    return {"median_ms": statistics.median(values), "min_ms": min(values), "max_ms": max(values), "values_ms": raw}
 
 
-def rates(values: list[float]) -> dict[str, float]:
-    """Median and spread of rates per second."""
-    return {"median_per_s": statistics.median(values), "min_per_s": min(values), "max_per_s": max(values)}
+def rates(values: list[float]) -> dict[str, Any]:
+    """Median and spread of rates per second, and the rates."""
+    spread = {"median_per_s": statistics.median(values), "min_per_s": min(values), "max_per_s": max(values)}
+    return {**spread, "values_per_s": [round(value, 2) for value in values]}
 
 
 def environment() -> dict[str, Any]:
-    """Machine and versions."""
+    """Command, machine and versions."""
     return {
+        "command": " ".join(["python -m", f"benchmarks.{Path(sys.argv[0]).stem}", *sys.argv[1:]]),
         "processor": processor(),
         "cores": torch.get_num_threads(),
         "python": platform.python_version(),
