@@ -210,8 +210,9 @@ class LearningConfig:
     """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
     has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
     engine: Literal["auto", "eager", "compiled"] = "auto"
-    """Updates operation by operation, or compiled by torch.compile (other roundings; 10 to 60 s at the start). auto
-    compiles on a CPU if the run makes 150,000 updates or more and a C++ compiler is there; a run keeps its engine."""
+    """Updates operation by operation, or compiled by torch.compile (other roundings; some 20 to 35 s at the start).
+    auto compiles on a CPU if the run makes 150,000 updates or more and a C++ compiler is there; a run keeps its
+    engine."""
     clip_rewards: bool = True
     """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from concurrent.futures import Future
 from typing import Any
 
@@ -95,7 +94,6 @@ def test_the_environments_step_while_the_update_runs(monkeypatch: pytest.MonkeyP
             updating.set()
             assert stepping.wait(20)
         update(self, batch, task)
-        time.sleep(0)
 
     monkeypatch.setattr(Play, "step", slow_step)
     monkeypatch.setattr(Learner, "update", slow_update)

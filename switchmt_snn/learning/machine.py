@@ -129,7 +129,7 @@ def keep_freed_memory() -> bool:
     """Let the C library keep what is freed instead of handing it back to the system at once.
 
     Activations of a large batch are allocated and freed at every update, and fresh pages cost more than the arithmetic
-    that is done on them (docs/performance.md, Scaling). No number changes, and a process keeps its peak.
+    that is done on them. No number changes, and a process keeps its peak.
 
     Returns:
         whether the C library (glibc) can be told so.

@@ -96,7 +96,7 @@ class ProcessGroup:
         return Batch(**parts)
 
     def share(self, value: Any = None) -> Any:
-        """The first process's value, in every process."""
+        """The first process's value, in every process (pickled between them, never to a file)."""
         box = [value]
         dist.broadcast_object_list(box, 0)
         return box[0]
