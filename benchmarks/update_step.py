@@ -108,7 +108,9 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
     work = {}
     for method, label in (("SwitchMT", "ours"), ("DQN_D", "our ANN of the same shape")):
         for precision in gflops:
-            for engine in ("eager", "compiled"):
+            for engine in ("eager", "native", "compiled"):
+                if engine == "native" and (device != "cpu" or method == "DQN_D"):
+                    continue  # made for spikes on a CPU
                 config = replace(
                     base,
                     network=replace(base.network, method=method, timesteps=timesteps),

@@ -379,7 +379,7 @@ def _doctor(argv: list[str]) -> int:
     import torch
     from ale_py import roms
 
-    from switchmt_snn.learning.machine import compile_problem, has_bfloat16, select_device
+    from switchmt_snn.learning.machine import built_engines, has_bfloat16, select_device
     from switchmt_snn.learning.memory import GIB, available_bytes
     from switchmt_snn.learning.run_folder import describe_environment
 
@@ -391,7 +391,7 @@ def _doctor(argv: list[str]) -> int:
         "atari_games": len(roms.get_all_rom_ids()),
         "available_memory_gib": round(available_bytes() / GIB, 1),
         "bfloat16_instructions": has_bfloat16(device),
-        "torch_compile": compile_problem() or "works",
+        **built_engines(),
     }
     if options.json:
         print(json.dumps(facts))

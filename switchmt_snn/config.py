@@ -209,10 +209,10 @@ class LearningConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
     """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
     has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
-    engine: Literal["auto", "eager", "compiled"] = "auto"
-    """Updates operation by operation, or compiled by torch.compile (other roundings; some 20 to 35 s at the start).
-    auto compiles on a CPU if the run makes 150,000 updates or more and a C++ compiler is there; a run keeps its
-    engine."""
+    engine: Literal["auto", "eager", "native", "compiled"] = "auto"
+    """Updates operation by operation, with neuron layers in C++ (native: CPU; built once, some 5 s), or compiled by
+    torch.compile (20 to 35 s at every start); each rounds in its own way. auto on a CPU with a C++ compiler: native
+    for the nature trunk in bfloat16, else compiled from 150,000 updates on, else eager. A run keeps its engine."""
     clip_rewards: bool = True
     """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576

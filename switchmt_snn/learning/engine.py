@@ -1,7 +1,8 @@
-"""How an update's three forward passes are run: operation by operation, compiled, or divided among processes.
+"""How an update's three forward passes are run: operation by operation, with neuron layers in C++, compiled, or divided
+among processes.
 
-Compiled code computes the same function with other roundings (a test compares the two). A membrane that lies within
-rounding of the threshold may fire in one and not in the other, as between any two orders of a sum.
+All compute the same function with other roundings (tests compare them). A membrane that lies within rounding of the
+threshold may fire in one and not in the other, as between any two orders of a sum.
 
 One compilation serves all tasks, because a task enters as tensors (:meth:`QNetwork.context`), and all steps, because an
 update's batch has one size. It is never given up midway: what cannot be compiled as a whole raises.
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from switchmt_snn.learning.processes import ProcessGroup
+from switchmt_snn.spiking.native_network import NativeNetwork
 from switchmt_snn.spiking.network import Context, QNetwork
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
@@ -51,11 +53,16 @@ def make_evaluate(
     Args:
         network: Q; read at every call.
         target: Q*; likewise.
-        engine: ``compiled``, or anything else for eager.
+        engine: ``native``, ``compiled``, or anything else for eager.
         precision: see :func:`~switchmt_snn.spiking.network.synaptic_products`.
         double_q: whether Q chooses the next action.
         group: the processes among which a batch is divided (eager only).
+
+    Raises:
+        ValueError: the native engine has no code for a setting of the network.
     """
+    if engine == "native":
+        return _evaluate_natively(network, target, precision, double_q)
     random = network.encoder.is_random
     trained: _Forward = _Replica(network, precision)
     if group is not None:
@@ -66,7 +73,8 @@ def make_evaluate(
 
     def values(x: Tensor, x_next: Tensor, x_choice: Tensor, context: Context, target_context: Context) -> Values:
         if not random:  # raw observations; the generator's numbers are drawn outside of compiled code
-            x, x_next, x_choice = (network.encode(observation) for observation in (x, x_next, x_choice))
+            x, x_next = network.encode(x), network.encode(x_next)
+            x_choice = x_next
         with torch.no_grad():
             choice_BA = next_BA = target.decide(x_next, target_context, precision=precision, training=False)
             if double_q:
@@ -82,6 +90,24 @@ def make_evaluate(
         x_next = target.encode(following, generator)
         x_choice = network.encode(following, generator) if double_q else x_next
         return run(network.encode(observation, generator), x_next, x_choice, context, target_context)
+
+    return evaluate
+
+
+def _evaluate_natively(network: QNetwork, target: QNetwork, precision: torch.dtype | None, double_q: bool) -> Evaluate:
+    ours, theirs = NativeNetwork(network, precision), NativeNetwork(target, precision)
+
+    def evaluate(observation: Tensor, following: Tensor, task: int, generator: torch.Generator) -> Values:
+        context, synapses = network.context(task), ours.synapses()
+        with torch.no_grad():
+            x_next = theirs.inputs(following, generator)
+            choice_BA = next_BA = theirs.decide(x_next, target.context(task), theirs.synapses(), training=False)
+            if double_q:
+                if network.encoder.is_random:
+                    x_next = ours.inputs(following, generator)
+                choice_BA = ours.decide(x_next, context, synapses, training=False)
+        x = ours.inputs(observation, generator)
+        return Values(ours.decide(x, context, synapses, training=True), next_BA, choice_BA)
 
     return evaluate
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import torch
 
-from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.spiking import native
 
 COMPILE_FROM_UPDATES = 150_000
 """``engine=auto`` compiles runs of at least this many updates: a minute at the start, minutes to hours back."""
@@ -46,7 +47,7 @@ def settle(
         the config, and what the user should know about the choice.
 
     Raises:
-        ConfigError: ``compiled`` is asked for and nothing can be compiled here, or the batch cannot be divided.
+        ConfigError: ``compiled`` or ``native`` is asked for and cannot be had here, or the batch cannot be divided.
     """
     learning = config.learning
     precision, engine = learning.precision, learning.engine
@@ -62,6 +63,15 @@ def settle(
     if processes > 1:
         _require_divisible(config, processes)
         engine = "eager"
+    if engine == "native" or (engine == "auto" and native_pays(config, precision, device)):
+        obstacle = native_obstacle(config, device)
+        if obstacle is not None and engine == "native":
+            raise ConfigError(f"learning.engine is 'native', {obstacle}; use learning.engine=eager")
+        if obstacle is not None:
+            notes.append(f"updates do not run natively: {obstacle}")
+        elif engine == "auto":
+            notes.append("updates run natively: neuron layers in C++, built once (learning.engine=eager does without)")
+        engine = "auto" if obstacle is not None else "native"
     if engine == "compiled" or (engine == "auto" and device.type == "cpu" and compiling_pays(config)):
         problem = compile_problem()
         if problem is not None and engine == "compiled":
@@ -82,9 +92,10 @@ def settle(
 
 
 def _require_divisible(config: ExperimentConfig, processes: int) -> None:
-    if config.learning.engine == "compiled":
+    if config.learning.engine in ("compiled", "native"):
         raise ConfigError(
-            f"learning.engine is 'compiled', expected eager or auto for the {processes} processes that torchrun started"
+            f"learning.engine is {config.learning.engine!r}, expected eager or auto for the {processes} processes that "
+            "torchrun started"
         )
     size = config.learning.batch_size
     if size % processes or size // processes < 2:
@@ -106,6 +117,27 @@ def compiling_pays(config: ExperimentConfig) -> bool:
     return planned_updates(config) >= COMPILE_FROM_UPDATES
 
 
+def native_pays(config: ExperimentConfig, precision: str, device: torch.device) -> bool:
+    """Whether ``auto`` takes the native engine: with bfloat16 products, neurons are what takes time.
+
+    In float32 products take most of it, and small networks gain more from compiled code (docs/performance.md).
+    """
+    return device.type == "cpu" and precision == "bfloat16" and config.network.trunk == "nature"
+
+
+def native_obstacle(config: ExperimentConfig, device: torch.device) -> str | None:
+    """What keeps the native engine from a run: seen and expected, for a message; None if nothing does."""
+    if device.type != "cpu":
+        return f"expected another engine on device {device.type}"
+    setting = native.unsupported(config.network, METHOD_TRAITS[config.network.method].spiking)
+    if setting is not None:
+        return f"which has no code for {setting}"
+    problem = native.problem()
+    if problem is not None:
+        return f"expected a C++ compiler that builds it (Debian: apt install g++), but: {problem}"
+    return None
+
+
 def has_bfloat16(device: torch.device) -> bool:
     """Whether a device multiplies bfloat16 faster than float32."""
     if device.type == "cuda":
@@ -123,6 +155,11 @@ def compile_problem() -> str | None:
     except Exception as error:
         return str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
     return None
+
+
+def built_engines() -> dict[str, str]:
+    """What of the engines that need a C++ compiler works here, and what goes wrong with the others."""
+    return {"torch_compile": compile_problem() or "works", "native_engine": native.problem() or "works"}
 
 
 def keep_freed_memory() -> bool:

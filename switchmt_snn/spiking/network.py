@@ -225,7 +225,9 @@ class QNetwork(nn.Module):
 
     def encode(self, observation: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The network's inputs ``[T, B, ...]`` (direct: ``[1, B, ...]``) for raw observations ``[B, *shape]``."""
-        return self.encoder(observation.to(torch.float32) * self.observation.scale, generator)
+        # Bytes become floats and are scaled in one pass.
+        numbers = observation if observation.dtype == torch.uint8 else observation.to(torch.float32)
+        return self.encoder(numbers * self.observation.scale, generator)
 
     def context(self, task: int) -> Context:
         """What a task changes in the network; the only thing that :meth:`decide` is told of it."""
@@ -256,7 +258,7 @@ class QNetwork(nn.Module):
             name: self._readout(name, cast(Stream, stream), features_TBN, context[name], state, activity, precision)
             for name, stream in self.streams.items()
         }
-        return self._combine(outputs)
+        return self.combine(outputs)
 
     def _over_time(self, current: Tensor) -> Tensor:
         """Repeat ``[1, B, ...]`` over T: direct encoding's first layer has the same current at every step."""
@@ -287,8 +289,11 @@ class QNetwork(nn.Module):
         activity: dict[str, Tensor] | None,
         precision: torch.dtype | None,
     ) -> Tensor:
-        """The stream's output: ``[B, outputs]`` (mean, last_membrane) or ``[T, B, outputs]`` (max_membrane)."""
         spikes_TBN = self._fire(name, stream, stream.current(features_TBN, context, precision), state, activity)
+        return self.read_out(stream, spikes_TBN)
+
+    def read_out(self, stream: Stream, spikes_TBN: Tensor) -> Tensor:
+        """A stream's output: ``[B, outputs]`` (mean, last_membrane) or ``[T, B, outputs]`` (max_membrane)."""
         if self.config.readout == "mean":
             return cast(Tensor, stream.head(spikes_TBN.mean(0)))
         outputs_t = stream.head(spikes_TBN)
@@ -297,7 +302,8 @@ class QNetwork(nn.Module):
             membranes.append(self.config.readout_beta * membranes[-1] + output_t)
         return membranes[-1] if self.config.readout == "last_membrane" else torch.stack(membranes)
 
-    def _combine(self, outputs: dict[str, Tensor]) -> Tensor:
+    def combine(self, outputs: dict[str, Tensor]) -> Tensor:
+        """Q-values ``[B, A]`` from the streams' outputs."""
         if "q" in outputs:
             q = outputs["q"]
         else:

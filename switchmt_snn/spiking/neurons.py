@@ -29,7 +29,7 @@ Surrogate = Callable[[Tensor], Tensor]
 SurrogateGradient = Callable[[Tensor, Tensor], Tensor]
 """``(U - theta, dL/dS) -> dL/dU``, which overwrites the first argument."""
 
-_DEFAULT_SLOPE = {"atan": 2.0, "sigmoid": 25.0, "fast_sigmoid": 25.0}
+DEFAULT_SLOPE = {"atan": 2.0, "sigmoid": 25.0, "fast_sigmoid": 25.0}
 _SLOPE_ARGUMENT = {
     "atan": "alpha",
     "sigmoid": "slope",
@@ -51,7 +51,7 @@ def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
     surrogate: Surrogate = factory(**arguments)
     if name != "sigmoid":
         return surrogate
-    lowest = -80.0 / arguments.get("slope", _DEFAULT_SLOPE[name])
+    lowest = -80.0 / arguments.get("slope", DEFAULT_SLOPE[name])
     return lambda x: surrogate(x.clamp(min=lowest))
 
 
@@ -61,7 +61,7 @@ def make_surrogate_gradient(name: str, slope: float | None = None) -> SurrogateG
     snnTorch's backward makes temporaries of the membranes' size; the usual surrogates do without, in place. Any other
     surrogate runs its own backward.
     """
-    k = slope if slope is not None else _DEFAULT_SLOPE.get(name, 0.0)
+    k = slope if slope is not None else DEFAULT_SLOPE.get(name, 0.0)
     if name == "atan":  # (k / 2) / (1 + (pi k x / 2)^2)
         return lambda x, grad: x.mul_(math.pi / 2 * k).square_().add_(1.0).reciprocal_().mul_(k / 2).mul_(grad)
     if name == "fast_sigmoid":  # 1 / (1 + k |x|)^2

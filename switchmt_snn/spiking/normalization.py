@@ -56,11 +56,19 @@ class TaskBatchNorm(nn.Module):
         batch_mean_C = total(x.sum(others)) / count
         centered = x - batch_mean_C.view(shape)
         batch_var_C = total(centered.square().sum(others)) / count
-        with torch.no_grad():  # the running variance is the unbiased one, as in F.batch_norm
-            mean_C.lerp_(batch_mean_C, self.momentum)
-            var_C.lerp_(batch_var_C * (count / (count - 1)), self.momentum)
+        self.move((mean_C, var_C), batch_mean_C, batch_var_C, count)
         scale_C = self.weight * (batch_var_C + self.epsilon).rsqrt()
         return centered * scale_C.view(shape) + self.bias.view(shape)
+
+    @torch.no_grad()
+    def move(self, statistics: tuple[Tensor, ...], batch_mean_C: Tensor, batch_var_C: Tensor, count: int) -> None:
+        """Move running statistics ``[C]`` towards those of a batch of ``count`` values per channel.
+
+        ``batch_var_C`` is the biased variance; the running one is unbiased, as in F.batch_norm.
+        """
+        mean_C, var_C = statistics
+        mean_C.lerp_(batch_mean_C, self.momentum)
+        var_C.lerp_(batch_var_C * (count / (count - 1)), self.momentum)
 
     def statistics(self, task: int) -> tuple[Tensor, Tensor]:
         """Running mean and variance ``[C]`` that eval mode uses for a task (views of the buffers)."""

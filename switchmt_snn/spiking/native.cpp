@@ -1,0 +1,255 @@
+// Input currents y * scale + shift of each channel, T steps of leaky integrate-and-fire neurons on them, and the
+// gradients of both, each in one pass over memory. The arithmetic is that of neurons.py, step by step.
+//
+// y [T or 1][R][C], spikes [T][R][C]: rows R (batch times places), channels C innermost. A stride of 0 (y_step, g_step)
+// says that every step shares one [R][C]. Sums run over a fixed number of parts, so they do not depend on the threads.
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <vector>
+
+namespace {
+
+constexpr long PARTS = 64;
+constexpr long WIDTH = 32;  // channels that are worked on together
+
+struct BFloat16 {
+    uint16_t bits;
+};
+
+inline float number(float x) { return x; }
+
+inline float number(BFloat16 x) {
+    uint32_t bits = uint32_t(x.bits) << 16;
+    float value;
+    std::memcpy(&value, &bits, 4);
+    return value;
+}
+
+inline void put(float* place, float x) { *place = x; }
+
+inline void put(BFloat16* place, float x) {  // to the nearest, ties to even; not a number stays so
+    uint32_t bits;
+    std::memcpy(&bits, &x, 4);
+    uint32_t rounded = (bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16;
+    place->bits = uint16_t(x != x ? 0x7fc0u : rounded);
+}
+
+struct Neuron {
+    float beta, threshold, slope;  // the last one of the surrogate gradient
+    int zero, fast_sigmoid;        // reset to zero, else by subtraction; fast sigmoid, else arctangent
+};
+
+template <bool FAST_SIGMOID>
+inline float surrogate(const Neuron& n, float x) {
+    constexpr float half_pi = 1.57079632679489661923f;
+    float z = FAST_SIGMOID ? 1.0f + n.slope * (x < 0 ? -x : x) : half_pi * n.slope * x;
+    return FAST_SIGMOID ? 1.0f / (z * z) : n.slope / 2 / (1.0f + z * z);
+}
+
+// Membranes u [T][WIDTH] of some channels of one row.
+template <bool ZERO, class Y>
+inline void membranes(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, long steps,
+                      long width, float* u) {
+    float before[WIDTH] = {}, fired[WIDTH] = {};  // at rest, below every threshold
+    for (long t = 0; t < steps; t++, y += y_step, u += WIDTH)
+        for (long i = 0; i < width; i++) {
+            float current = number(y[i]) * scale[i] + shift[i], b = before[i];
+            float now = ZERO ? (b - b * fired[i]) * n.beta + current : (b * n.beta + current) - fired[i] * n.threshold;
+            before[i] = u[i] = now;
+            fired[i] = now > n.threshold ? 1.0f : 0.0f;
+        }
+}
+
+// run(first channel, number of them) over all channels; whole blocks have a constant width.
+template <class F>
+inline void blocks(long channels, F run) {
+    long c = 0;
+    for (; c + WIDTH <= channels; c += WIDTH) run(c, WIDTH);
+    if (c < channels) run(c, channels - c);
+}
+
+template <bool ZERO, class Y, class S>
+void fire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, S* spikes, long steps,
+          long rows, long channels, int threads) {
+#pragma omp parallel num_threads(threads)
+    {
+        std::vector<float> u(steps * WIDTH);
+#pragma omp for schedule(static)
+        for (long r = 0; r < rows; r++)
+            blocks(channels, [&](long c, long width) {
+                long at = r * channels + c;
+                membranes<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width, u.data());
+                for (long t = 0; t < steps; t++)
+                    for (long i = 0; i < width; i++)
+                        put(spikes + t * rows * channels + at + i, u[t * WIDTH + i] > n.threshold ? 1.0f : 0.0f);
+            });
+    }
+}
+
+// The currents' gradient [T or 1][R][C], its sum [C] over steps and rows, and that of its product with y - center.
+template <bool ZERO, bool FAST_SIGMOID, class Y, class G>
+void unfire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, const float* center,
+            const G* grad_spikes, long g_step, float* grad, double* sums, long steps, long rows, long channels,
+            int threads) {
+    std::vector<float> partial(PARTS * 2 * channels, 0.0f);
+#pragma omp parallel num_threads(threads)
+    {
+        std::vector<float> u(steps * WIDTH);
+#pragma omp for schedule(static)
+        for (long part = 0; part < PARTS; part++)
+            for (long r = rows * part / PARTS; r < rows * (part + 1) / PARTS; r++)
+                blocks(channels, [&](long c, long width) {
+                    long at = r * channels + c;
+                    float *sum = &partial[part * 2 * channels + c], *sum_y = sum + channels;
+                    float after[WIDTH] = {}, total[WIDTH] = {}, fired[WIDTH];
+                    membranes<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width, u.data());
+                    for (long t = steps - 1; t >= 0; t--) {
+                        const float* now = u.data() + t * WIDTH;
+                        const G* g = grad_spikes + t * g_step + at;
+                        for (long i = 0; i < width; i++) fired[i] = now[i] > n.threshold ? 1.0f : 0.0f;
+                        for (long i = 0; i < width; i++) {
+                            float kept = ZERO ? after[i] - after[i] * fired[i] : after[i];
+                            float slope = surrogate<FAST_SIGMOID>(n, now[i] - n.threshold);
+                            after[i] = number(g[i]) * slope + kept * n.beta;
+                            total[i] += after[i];
+                        }
+                        if (y_step != 0) {
+                            float* out = grad + t * rows * channels + at;
+                            for (long i = 0; i < width; i++) out[i] = after[i];
+                            for (long i = 0; i < width; i++)
+                                sum_y[i] += after[i] * (number(y[t * y_step + at + i]) - center[c + i]);
+                        }
+                    }
+                    for (long i = 0; i < width; i++) sum[i] += total[i];
+                    if (y_step == 0) {
+                        for (long i = 0; i < width; i++) grad[at + i] = total[i];
+                        for (long i = 0; i < width; i++) sum_y[i] += total[i] * (number(y[at + i]) - center[c + i]);
+                    }
+                });
+    }
+    for (long part = 0; part < PARTS; part++)
+        for (long i = 0; i < 2 * channels; i++) sums[i] += partial[part * 2 * channels + i];
+}
+
+template <class Y>
+void combine(const float* grad, const Y* y, const float* scale, const float* center, const float* slope,
+             const float* constant, Y* out, long rows, long channels, int threads) {
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (long r = 0; r < rows; r++)
+        for (long c = 0; c < channels; c++) {
+            long at = r * channels + c;
+            put(out + at, grad[at] * scale[c] + (number(y[at]) - center[c]) * slope[c] + constant[c]);
+        }
+}
+
+template <class Y>
+void moments(const Y* y, float* mean, float* variance, long rows, long channels, int threads) {
+    std::vector<float> partial(PARTS * channels);
+    for (bool squares : {false, true}) {
+        std::fill(partial.begin(), partial.end(), 0.0f);
+#pragma omp parallel for schedule(static) num_threads(threads)
+        for (long part = 0; part < PARTS; part++) {
+            float* sum = &partial[part * channels];
+            for (long r = rows * part / PARTS; r < rows * (part + 1) / PARTS; r++)
+                for (long c = 0; c < channels; c++) {
+                    float x = number(y[r * channels + c]);
+                    sum[c] += squares ? (x - mean[c]) * (x - mean[c]) : x;
+                }
+        }
+        for (long c = 0; c < channels; c++) {
+            double total = 0;
+            for (long part = 0; part < PARTS; part++) total += partial[part * channels + c];
+            (squares ? variance : mean)[c] = float(total / double(rows));
+        }
+    }
+}
+
+template <class Y>
+void images(const uint8_t* x, float scale, Y* out, long batch, long channels, long places, int threads) {
+    constexpr long BLOCK = 64;
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (long b = 0; b < batch; b++)
+        for (long p = 0; p < places; p += BLOCK) {
+            const uint8_t* from = x + b * channels * places + p;
+            Y* to = out + (b * places + p) * channels;
+            auto interleave = [=](long width, long cs) {
+                for (long i = 0; i < width; i++)
+                    for (long c = 0; c < cs; c++) put(to + i * cs + c, float(from[c * places + i]) * scale);
+            };
+            if (channels == 4 && places - p >= BLOCK)
+                interleave(BLOCK, 4);  // constants, which the compiler makes much of
+            else
+                interleave(std::min(BLOCK, places - p), channels);
+        }
+}
+
+// f(...) with the constants and types that a call asks for.
+template <class F>
+void with_flag(bool flag, F f) {
+    flag ? f(std::true_type()) : f(std::false_type());
+}
+
+template <class F>
+void with_type(bool low, F f) {
+    low ? f(BFloat16()) : f(float());
+}
+
+template <class F>
+void with_types(bool low, bool other_low, F f) {  // all floats, all bfloat16, or floats beside bfloat16 currents
+    if (!low) return f(float(), float());
+    other_low ? f(BFloat16(), BFloat16()) : f(BFloat16(), float());
+}
+
+}  // namespace
+
+extern "C" {
+
+// Spikes of T steps.
+void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const float* scale, const float* shift,
+              void* spikes, int spikes_low, long steps, long rows, long channels, int threads) {
+    with_flag(n->zero, [&](auto zero) {
+        with_types(y_low, spikes_low, [&](auto y_, auto s_) {
+            fire<zero.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, (decltype(s_)*)spikes, steps, rows,
+                             channels, threads);
+        });
+    });
+}
+
+// Gradients of the currents from those of the spikes; sums [2][C] must be zero before.
+void snn_unfire(const Neuron* n, const void* y, int y_low, long y_step, const float* scale, const float* shift,
+                const float* center, const void* grad_spikes, int grad_low, long g_step, float* grad,
+                double* sums, long steps, long rows, long channels, int threads) {
+    with_flag(n->zero, [&](auto zero) {
+        with_flag(n->fast_sigmoid, [&](auto fast) {
+            with_types(y_low, grad_low, [&](auto y_, auto g_) {
+                unfire<zero.value, fast.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, center,
+                                               (const decltype(g_)*)grad_spikes, g_step, grad, sums, steps, rows,
+                                               channels, threads);
+            });
+        });
+    });
+}
+
+// grad * scale + (y - center) * slope + constant.
+void snn_combine(const float* grad, const void* y, int y_low, const float* scale, const float* center,
+                 const float* slope, const float* constant, void* out, long rows, long channels, int threads) {
+    with_type(y_low, [&](auto y_) {
+        using Y = decltype(y_);
+        combine(grad, (const Y*)y, scale, center, slope, constant, (Y*)out, rows, channels, threads);
+    });
+}
+
+// Mean and biased variance of each channel.
+void snn_moments(const void* y, int y_low, float* mean, float* variance, long rows, long channels, int threads) {
+    with_type(y_low, [&](auto y_) { moments((const decltype(y_)*)y, mean, variance, rows, channels, threads); });
+}
+
+// Images [B][C][P] of bytes, P places, times scale, to numbers [B][P][C].
+void snn_images(const uint8_t* x, float scale, void* out, int out_low, long batch, long channels, long places,
+                int threads) {
+    with_type(out_low, [&](auto o_) { images(x, scale, (decltype(o_)*)out, batch, channels, places, threads); });
+}
+}

@@ -1,0 +1,318 @@
+"""Neuron layers in C++ (``native.cpp``), for updates on a CPU: the currents' scale and shift, T steps of neurons, and
+all their gradients take two passes over memory, where single operations take some thirty.
+
+The source is compiled by the machine's C++ compiler at its first use, for the processor at hand, and kept in the user's
+cache. The parallel loops run in PyTorch's own pool of threads.
+
+Shapes: S steps of the currents (T, or 1 that all steps share), T steps of the spikes, R rows, C channels.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from switchmt_snn.config import NetworkConfig
+from switchmt_snn.spiking.neurons import DEFAULT_SLOPE
+
+_SOURCE = Path(__file__).with_suffix(".cpp")
+# No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
+_FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp",
+    "-fPIC",
+)
+_SURROGATES = ("atan", "fast_sigmoid")
+"""Those that ``native.cpp`` has."""
+
+_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_long, "f": ctypes.c_float}
+_ARGUMENTS = {
+    "snn_fire": "ppilpppillli",
+    "snn_unfire": "ppilppppilppllli",
+    "snn_combine": "ppippppplli",
+    "snn_moments": "pipplli",
+    "snn_images": "pfpillli",
+}
+"""Pointers, ints, longs and floats that the functions of ``native.cpp`` take."""
+
+
+class _Neuron(ctypes.Structure):
+    _fields_ = (
+        ("beta", ctypes.c_float),
+        ("threshold", ctypes.c_float),
+        ("slope", ctypes.c_float),
+        ("zero", ctypes.c_int),
+        ("fast_sigmoid", ctypes.c_int),
+    )
+
+
+def unsupported(config: NetworkConfig, spiking: bool) -> str | None:
+    """The setting that ``native.cpp`` has no code for; None if there is none."""
+    if not spiking:
+        return f"network.method={config.method} (no spikes)"
+    if config.learn_beta or config.learn_threshold:
+        return "network.learn_beta or network.learn_threshold"
+    if config.surrogate not in _SURROGATES:
+        return f"network.surrogate={config.surrogate}"
+    if config.k_winners is not None:
+        return "network.k_winners"
+    return "network.neuron_engine=snntorch" if config.neuron_engine == "snntorch" else None
+
+
+def problem() -> str | None:
+    """One line on why ``native.cpp`` cannot be compiled and loaded here; None if it can."""
+    try:
+        _library()
+    except (OSError, subprocess.SubprocessError) as error:
+        output = getattr(error, "stderr", None) or str(error)
+        return str(output).strip().splitlines()[0][:120]
+    return None
+
+
+@functools.cache
+def _library() -> ctypes.CDLL:
+    library = ctypes.CDLL(str(_compile()))
+    for name, kinds in _ARGUMENTS.items():
+        function = getattr(library, name)
+        function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
+    return library
+
+
+def _compile() -> Path:
+    """The compiled library, made if the cache has none for this source, compiler and processor."""
+    compiler = shutil.which(os.environ.get("CXX", "g++"))
+    if compiler is None:
+        raise OSError(f"no C++ compiler {os.environ.get('CXX', 'g++')!r}")
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True).stdout
+    what = [_SOURCE.read_text(), version, " ".join(_FLAGS), platform.machine(), _instructions()]
+    name = f"native-{hashlib.sha256(chr(0).join(what).encode()).hexdigest()[:16]}.so"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "switchmt_snn"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / name).exists():
+            return folder / name
+        scratch = Path(tempfile.mkdtemp(dir=folder))
+    except OSError:  # no home to write to
+        folder = scratch = Path(tempfile.mkdtemp())
+    try:
+        compiled, linked = scratch / "native.o", scratch / name
+        for command in ([*_FLAGS, "-c", str(_SOURCE), "-o", str(compiled)], ["-shared", str(compiled), "-o", linked]):
+            # Linked without OpenMP: its symbols are found in the one that PyTorch has loaded.
+            subprocess.run([compiler, *command], capture_output=True, text=True, check=True)
+        os.replace(linked, folder / name)
+    finally:
+        if scratch != folder:
+            shutil.rmtree(scratch, ignore_errors=True)
+    return folder / name
+
+
+def _instructions() -> str:
+    """What this processor can do, as far as the system tells: homes are shared by machines."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith(("flags", "Features")):
+                return line
+    return platform.processor()
+
+
+class Currents(NamedTuple):
+    """How currents come from synaptic products: ``y * scale + shift``, and what the gradient must know of it."""
+
+    scale_C: Tensor
+    shift_C: Tensor
+    center_C: Tensor
+    """The batch's mean; 0 without normalisation."""
+    inverse_std_C: Tensor | None
+    """Of the batch; None if scale and shift do not depend on it."""
+
+
+class Neurons:
+    """T steps of a network's neurons on synaptic products ``[S, R, C]``, floats or bfloat16.
+
+    Spikes are those of :class:`~switchmt_snn.spiking.neurons.SpikingLayer` for the same currents.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        """Raises ValueError for what :func:`unsupported` names."""
+        if (setting := unsupported(config, spiking=True)) is not None:
+            raise ValueError(f"the native engine has no code for {setting}; use another engine")
+        slope = DEFAULT_SLOPE[config.surrogate] if config.surrogate_slope is None else config.surrogate_slope
+        beta = 1.0 if config.neuron == "IF" else min(max(config.beta, 0.0), 1.0)
+        fast_sigmoid = config.surrogate == "fast_sigmoid"
+        self._neuron = _Neuron(beta, config.threshold, slope, config.reset == "zero", fast_sigmoid)
+        self.timesteps = config.timesteps
+
+    def gated(self, y_SRC: Tensor, gain_C: Tensor, dtype: torch.dtype) -> Tensor:
+        """Spikes ``[T, R, C]`` for currents ``y * gain``."""
+        gain_C, zero_C = gain_C.contiguous(), torch.zeros(y_SRC.shape[-1])
+        if not torch.is_grad_enabled():
+            return self.fire(y_SRC, gain_C, zero_C, dtype)
+        return _spikes(self, y_SRC, gain_C, zero_C, None, None, dtype)
+
+    def normalized(
+        self, y_SRC: Tensor, weight_C: Tensor, bias_C: Tensor, mean_C: Tensor, inverse_std_C: Tensor, of_batch: bool
+    ) -> Tensor:
+        """Spikes ``[T, R, C]`` for currents ``(y - mean) * inverse_std * weight + bias``.
+
+        ``of_batch``: mean and deviation are those of ``y`` itself, and the gradient goes through them.
+        """
+        if of_batch and torch.is_grad_enabled():
+            return _spikes(self, y_SRC, weight_C, bias_C, mean_C, inverse_std_C, y_SRC.dtype)
+        scale_C = weight_C.detach() * inverse_std_C
+        return self.fire(y_SRC, scale_C, bias_C.detach() - mean_C * scale_C, y_SRC.dtype)
+
+    def fire(self, y_SRC: Tensor, scale_C: Tensor, shift_C: Tensor, dtype: torch.dtype) -> Tensor:
+        """Spikes ``[T, R, C]``, without gradient."""
+        _, rows, channels = y_SRC.shape
+        spikes = torch.empty(self.timesteps, rows, channels, dtype=dtype)
+        _library().snn_fire(
+            ctypes.addressof(self._neuron),
+            *_typed(y_SRC),
+            _step(y_SRC),
+            scale_C.data_ptr(),
+            shift_C.data_ptr(),
+            *_typed(spikes),
+            self.timesteps,
+            rows,
+            channels,
+            torch.get_num_threads(),
+        )
+        return spikes
+
+    def unfire(self, y_SRC: Tensor, currents: Currents, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of the currents ``[S, R, C]``, and the sums ``[2, C]`` of it and of it times ``y - center``."""
+        steps, rows, channels = y_SRC.shape
+        grad_SRC = torch.empty(steps, rows, channels)
+        sums_2C = torch.zeros(2, channels, dtype=torch.float64)
+        if not (grad_TRC.stride(0) == 0 and grad_TRC[0].is_contiguous()):
+            grad_TRC = grad_TRC.contiguous()
+        _library().snn_unfire(
+            ctypes.addressof(self._neuron),
+            *_typed(y_SRC),
+            _step(y_SRC),
+            currents.scale_C.data_ptr(),
+            currents.shift_C.data_ptr(),
+            currents.center_C.data_ptr(),
+            *_typed(grad_TRC),
+            grad_TRC.stride(0),
+            grad_SRC.data_ptr(),
+            sums_2C.data_ptr(),
+            self.timesteps,
+            rows,
+            channels,
+            torch.get_num_threads(),
+        )
+        return grad_SRC, sums_2C.to(torch.float32)
+
+
+def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and biased variance of every channel ``[C]`` over steps and rows."""
+    steps, rows, channels = y_SRC.shape
+    mean_C, variance_C = torch.empty(channels), torch.empty(channels)
+    _library().snn_moments(
+        *_typed(y_SRC), mean_C.data_ptr(), variance_C.data_ptr(), steps * rows, channels, torch.get_num_threads()
+    )
+    return mean_C, variance_C
+
+
+def scaled_images(x_BCHW: Tensor, scale: float, dtype: torch.dtype) -> Tensor:
+    """Images of bytes times ``scale``, rounded to a dtype: ``[B, C, H, W]`` with channels innermost in memory."""
+    batch, channels, height, width = x_BCHW.shape
+    x_BCHW = x_BCHW.contiguous()
+    out_BHWC = torch.empty(batch, height, width, channels, dtype=dtype)
+    _library().snn_images(
+        x_BCHW.data_ptr(), scale, *_typed(out_BHWC), batch, channels, height * width, torch.get_num_threads()
+    )
+    return out_BHWC.permute(0, 3, 1, 2)
+
+
+class _Spikes(torch.autograd.Function):
+    """Spikes of ``y * scale + shift``; with ``inverse_std``, a and b are a normalisation's weight and bias."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        y_SRC: Tensor,
+        a_C: Tensor,
+        b_C: Tensor,
+        mean_C: Tensor | None,
+        inverse_std_C: Tensor | None,
+        neurons: Neurons,
+        dtype: torch.dtype,
+    ) -> Tensor:
+        if mean_C is None or inverse_std_C is None:
+            currents = Currents(a_C, b_C, torch.zeros_like(b_C), None)
+        else:
+            scale_C = a_C * inverse_std_C
+            currents = Currents(scale_C, b_C - mean_C * scale_C, mean_C, inverse_std_C)
+        ctx.save_for_backward(y_SRC, *currents)
+        ctx.neurons = neurons
+        return neurons.fire(y_SRC, currents.scale_C, currents.shift_C, dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        y_SRC, *kept = ctx.saved_tensors
+        currents = Currents(*kept)
+        grad_SRC, (sum_C, product_C) = ctx.neurons.unfire(y_SRC, currents, gradients[0])
+        if currents.inverse_std_C is None:  # product_C: the center is 0
+            slope_C = constant_C = torch.zeros_like(sum_C)
+            grad_a_C = product_C
+        else:  # the batch's mean and deviation follow y
+            count = y_SRC.numel() // y_SRC.shape[-1]
+            grad_a_C = product_C * currents.inverse_std_C
+            slope_C = currents.scale_C * currents.inverse_std_C * grad_a_C / -count
+            constant_C = currents.scale_C * sum_C / -count
+        grad_y_SRC = torch.empty_like(y_SRC)
+        _library().snn_combine(
+            grad_SRC.data_ptr(),
+            *_typed(y_SRC),
+            currents.scale_C.data_ptr(),
+            currents.center_C.data_ptr(),
+            slope_C.data_ptr(),
+            constant_C.data_ptr(),
+            grad_y_SRC.data_ptr(),
+            y_SRC.shape[0] * y_SRC.shape[1],
+            y_SRC.shape[2],
+            torch.get_num_threads(),
+        )
+        return grad_y_SRC, grad_a_C, sum_C, None, None, None, None
+
+
+def _spikes(
+    neurons: Neurons,
+    y_SRC: Tensor,
+    a_C: Tensor,
+    b_C: Tensor,
+    mean_C: Tensor | None,
+    inverse_std_C: Tensor | None,
+    dtype: torch.dtype,
+) -> Tensor:
+    what = (y_SRC, a_C, b_C, mean_C, inverse_std_C, neurons, dtype)
+    spikes: Tensor = _Spikes.apply(*what)  # type: ignore[no-untyped-call]
+    return spikes
+
+
+def _typed(tensor: Tensor) -> tuple[int, int]:
+    """Where numbers lie, and whether they are bfloat16."""
+    return tensor.data_ptr(), int(tensor.dtype == torch.bfloat16)
+
+
+def _step(y_SRC: Tensor) -> int:
+    return y_SRC.stride(0) if y_SRC.shape[0] > 1 else 0

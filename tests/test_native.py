@@ -1,0 +1,224 @@
+"""The native neuron layers (C++) against PyTorch's operations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from switchmt_snn.config import NetworkConfig
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning import machine
+from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.replay import Batch
+from switchmt_snn.spiking import native
+from switchmt_snn.spiking.native import Neurons, batch_moments, scaled_images
+from switchmt_snn.spiking.network import ObservationSpec, build_network
+from switchmt_snn.spiking.neurons import SpikingLayer
+from tests.conftest import small_config
+
+CPU = torch.device("cpu")
+builds = pytest.mark.skipif(native.problem() is not None, reason="no C++ compiler")
+FORMS = {
+    "neuron": st.sampled_from(["IF", "LIF"]),
+    "reset": st.sampled_from(["zero", "subtract"]),
+    "surrogate": st.sampled_from(["atan", "fast_sigmoid"]),
+    "surrogate_slope": st.sampled_from([None, 0.5, 3.0]),
+    "beta": st.floats(0.0, 1.0, width=32),
+    "threshold": st.sampled_from([0.125, 0.5, 1.0]),
+}
+
+
+def plain_gated(config: NetworkConfig, y_SRC: Tensor, gain_C: Tensor) -> Tensor:
+    current_SRC = y_SRC.float() * gain_C
+    spikes, _ = SpikingLayer(config)(current_SRC.expand(config.timesteps, *y_SRC.shape[1:]))
+    return spikes
+
+
+@builds
+@settings(max_examples=60, deadline=None)
+@given(
+    form=st.fixed_dictionaries(FORMS),
+    timesteps=st.integers(1, 7),
+    shared=st.booleans(),
+    rows=st.integers(1, 80),
+    channels=st.integers(1, 70),
+    low=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_spikes_are_bitwise_those_of_the_eager_neurons(form, timesteps, shared, rows, channels, low, seed) -> None:
+    """And gradients equal to rounding, for shared and single currents, whole and broken blocks of channels."""
+    config = NetworkConfig(timesteps=timesteps, **form)
+    torch.manual_seed(seed)
+    y = (torch.randn(1 if shared else timesteps, rows, channels) * 1.5).to(torch.bfloat16 if low else torch.float32)
+    weights, results = torch.randn(timesteps, rows, channels), []
+    for run in (Neurons(config).gated, None):
+        y_SRC, gain_C = y.clone().requires_grad_(), torch.linspace(0.3, 1.2, channels).requires_grad_()
+        spikes = plain_gated(config, y_SRC, gain_C) if run is None else run(y_SRC, gain_C, torch.float32)
+        (spikes * weights).sum().backward()
+        results.append((spikes, y_SRC.grad, gain_C.grad))
+    (ours, *our_grads), (theirs, *their_grads) = results
+    assert torch.equal(ours, theirs)
+    for our_grad, their_grad in zip(our_grads, their_grads, strict=True):
+        scale = float(their_grad.abs().max()) + 1e-6
+        torch.testing.assert_close(
+            our_grad, their_grad, rtol=1e-2 if low else 1e-4, atol=scale * (5e-3 if low else 1e-5)
+        )
+
+
+@builds
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("steps", [1, 4])
+def test_normalized_spikes_equal_batch_norm_and_neurons(dtype: torch.dtype, steps: int) -> None:
+    """In training: spikes, and the gradient through the batch's own mean and variance."""
+    config = NetworkConfig(timesteps=4)
+    torch.manual_seed(3)
+    y, g = (torch.randn(steps, 400, 24) * 3 + 5).to(dtype), torch.randn(4, 400, 24)
+    weight, bias = torch.rand(24) + 0.5, torch.randn(24) / 3
+    results = []
+    for is_native in (True, False):
+        y_SRC, weight_C, bias_C = (x.clone().requires_grad_() for x in (y, weight, bias))
+        if is_native:
+            mean_C, var_C = batch_moments(y_SRC.detach())
+            inverse_std_C = (var_C + 1e-5).rsqrt()
+            spikes = Neurons(config).normalized(y_SRC, weight_C, bias_C, mean_C, inverse_std_C, of_batch=True)
+        else:
+            flat = y_SRC.flatten(0, 1).to(torch.float64)
+            current = F.batch_norm(flat, None, None, weight_C.double(), bias_C.double(), True, 0.1, 1e-5)
+            current = current.float().view(steps, 400, 24).expand(4, 400, 24)
+            spikes, _ = SpikingLayer(config)(current)
+        (spikes.float() * g.to(dtype).float()).sum().backward()
+        results.append((spikes.float(), y_SRC.grad, weight_C.grad, bias_C.grad))
+    assert results[0][0].mean() > 0.1
+    assert torch.equal(results[0][0], results[1][0])
+    for ours, theirs in zip(results[0][1:], results[1][1:], strict=True):
+        scale = float(theirs.abs().max())
+        low = dtype == torch.bfloat16
+        torch.testing.assert_close(ours, theirs, rtol=1e-2 if low else 1e-4, atol=scale * (1e-2 if low else 1e-5))
+
+
+@builds
+def test_moments_keep_their_digits_far_from_zero() -> None:
+    y = torch.randn(2, 5000, 40) + 300.0
+    mean_C, var_C = batch_moments(y)
+    torch.testing.assert_close(mean_C.double(), y.double().mean((0, 1)), rtol=1e-6, atol=0)
+    torch.testing.assert_close(var_C.double(), y.double().var((0, 1), correction=0), rtol=1e-5, atol=0)
+
+
+@builds
+@pytest.mark.parametrize("shape", [(3, 4, 84, 84), (2, 4, 7, 9), (2, 1, 5, 5), (1, 6, 13, 11)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_scaled_images_are_bitwise_those_of_torch(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    x = torch.randint(0, 256, shape, dtype=torch.uint8)
+    ours = scaled_images(x, 1 / 255, dtype)
+    assert torch.equal(ours, (x.float() * (1 / 255)).to(dtype))
+    assert ours.is_contiguous(memory_format=torch.channels_last)
+
+
+@builds
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    config = NetworkConfig(timesteps=4)
+    y, g = torch.randn(4, 333, 48), torch.randn(4, 333, 48)
+    threads, results = torch.get_num_threads(), []
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            y_SRC, gain_C = y.clone().requires_grad_(), torch.ones(48, requires_grad=True)
+            (Neurons(config).gated(y_SRC, gain_C, torch.float32) * g).sum().backward()
+            results.append((y_SRC.grad, gain_C.grad, *batch_moments(y)))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@builds
+def test_the_target_is_rounded_anew_after_its_copy() -> None:
+    """Its rounded weights are kept between copies, and only between them."""
+    spec, rng = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), np.random.default_rng(0)
+    images = (rng.random((2, 8, 4, 10, 10)) < 0.4).astype(np.uint8)
+    rewards, never = rng.normal(size=8).astype(np.float32), np.zeros(8, np.bool_)
+    batch = Batch(images[0], rng.integers(0, 6, 8), rewards, images[1], never)
+    losses = []
+    for engine in ("native", "eager"):
+        config = small_config(network={"trunk": "minatar"}, learning={"engine": engine})
+        network = build_network(config.network, spec, 1)
+        learner = Learner(network, config.learning, np.ones((3, 6), np.bool_), CPU, 0)
+        for number in range(6):
+            learner.update(batch, 0)
+            if number == 2:
+                learner.copy_target()
+        losses.append(learner.take_means()["loss"])
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ({"method": "DQN_D"}, "no spikes"),
+        ({"learn_beta": True, "neuron": "LIF"}, "learn_beta"),
+        ({"surrogate": "sigmoid"}, "surrogate=sigmoid"),
+        ({"k_winners": 3}, "k_winners"),
+        ({"neuron_engine": "snntorch"}, "neuron_engine"),
+    ],
+)
+def test_what_it_has_no_code_for_is_refused_by_name(setting: dict[str, Any], named: str) -> None:
+    asked = small_config(network=setting, learning={"engine": "native"})
+    with pytest.raises(ConfigError, match=f"learning.engine is 'native', which has no code for .*{named}.*eager"):
+        machine.settle(asked, None, CPU)
+
+
+def test_auto_is_native_in_bfloat16_on_the_nature_trunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "native_obstacle", lambda config, device: None)
+    nature = {"network": {"trunk": "nature"}, "learning": {"precision": "bfloat16"}}
+    settled, words = machine.settle(small_config(**nature), None, CPU)
+    assert settled.learning.engine == "native"
+    assert "C++" in words[-1]
+    for other in (
+        {**nature, "network": {"trunk": "minatar"}},
+        {**nature, "learning": {"precision": "float32"}},
+        {**nature, "learning": {"precision": "bfloat16", "engine": "eager"}},
+    ):
+        assert machine.settle(small_config(**other), None, CPU)[0].learning.engine == "eager"
+    monkeypatch.setattr(machine, "native_obstacle", lambda config, device: "expected luck")
+    settled, words = machine.settle(small_config(**nature), None, CPU)
+    assert settled.learning.engine == "eager"
+    assert "expected luck" in words[-1]
+
+
+@builds
+def test_it_is_built_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    built = native._compile()
+    assert built.parent == tmp_path / "switchmt_snn"
+    assert [path.name for path in built.parent.iterdir()] == [built.name]
+    changed = built.stat().st_mtime_ns
+    assert native._compile().stat().st_mtime_ns == changed
+
+
+def test_no_compiler_and_a_failing_one_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native._library.cache_clear()
+    try:
+        monkeypatch.setenv("CXX", "no-such-compiler")
+        assert native.problem() == "no C++ compiler 'no-such-compiler'"
+        script = tmp_path / "failing"
+        script.write_text("#!/bin/sh\n[ $1 = --version ] && exit 0\necho unhappy >&2\nexit 1\n")
+        script.chmod(0o755)
+        monkeypatch.setenv("CXX", str(script))
+        assert native.problem() == "unhappy"
+        assert [path.name for path in (tmp_path / "switchmt_snn").iterdir()] == []
+        asked = small_config(learning={"engine": "native"})
+        with pytest.raises(
+            ConfigError, match=r"'native', expected a C\+\+ compiler .*unhappy; use learning.engine=eager"
+        ):
+            machine.settle(asked, None, CPU)
+    finally:
+        native._library.cache_clear()
