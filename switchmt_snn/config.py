@@ -209,10 +209,10 @@ class LearningConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
     """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
     has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
-    engine: Literal["auto", "eager", "native", "compiled"] = "auto"
-    """Updates operation by operation, with neuron layers in C++ (native: CPU; built once, some 5 s), or compiled by
-    torch.compile (20 to 35 s at every start); each rounds in its own way. auto on a CPU with a C++ compiler: native
-    for the nature trunk in bfloat16, else compiled from 150,000 updates on, else eager. A run keeps its engine."""
+    engine: Literal["auto", "eager", "native", "compiled", "graph"] = "auto"
+    """Updates operation by operation, with neuron layers in C++ (native: CPU; built once, some 5 s), compiled by
+    torch.compile (20 to 35 s per start), or compiled into a CUDA graph; each rounds in its own way. auto, on a CPU with
+    a C++ compiler: native for the nature trunk in bfloat16, compiled from 150,000 updates on; else eager."""
     clip_rewards: bool = True
     """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576
@@ -221,6 +221,8 @@ class LearningConfig:
     """Keep frames compressed, without loss and with the same samples. auto: if plain ones would take over 1 GiB."""
     replay_max_gib: float = 4.0
     """Compressed frames of all tasks together take no more; while they would, the oldest leave."""
+    replay_on_device: bool = False
+    """Keep frames as plain bytes where the network lies (a GPU's memory), so that batches are gathered there."""
     learning_starts_steps: int = 512
     """Transitions that a task must hold before it is sampled; until then its actions are random."""
     update_every_steps: int = 1
@@ -247,6 +249,9 @@ class LearningConfig:
         _require(self.adam_epsilon > 0, "learning.adam_epsilon", self.adam_epsilon, "above 0")
         _require(0.0 <= self.discount <= 1.0, "learning.discount", self.discount, "within [0, 1]")
         _require(self.gradient_clip_at > 0, "learning.gradient_clip_at", self.gradient_clip_at, "above 0")
+        if self.replay_on_device:
+            asked = self.replay_compression
+            _require(asked != "zstd", "learning.replay_compression", asked, "auto or none with replay_on_device")
         _require(self.replay_max_gib > 0, "learning.replay_max_gib", self.replay_max_gib, "above 0")
         for name in ("replay_capacity_steps", "update_every_steps", "target_update_every_steps", "epsilon_decay_steps"):
             value = getattr(self, name)
@@ -300,12 +305,7 @@ class SwitchingConfig:
     """Leave at this many steps of the visit in any case, also within an episode; null never."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "visit_episodes",
-            "visit_steps",
-            "window_episodes",
-            "plateau_patience_episodes",
-        ):
+        for name in ("visit_episodes", "visit_steps", "window_episodes", "plateau_patience_episodes"):
             value = getattr(self, name)
             _require(value >= 1, f"switching.{name}", value, "at least 1")
         w = self.plateau_window_episodes

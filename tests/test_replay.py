@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -58,6 +59,17 @@ class NaiveLane:
         return [t for t in self.transitions if t["oldest"] >= oldest]
 
 
+FORMS = ("plain", "compressed", "device")
+
+
+def ring(
+    form: str, capacity: int, lanes: int, shape: tuple[int, ...], stack: int, dtype: type = np.uint8
+) -> FrameReplay:
+    """A replay whose frames lie as ``form`` says; the device is the CPU here."""
+    device = torch.device("cpu") if form == "device" else None
+    return FrameReplay(capacity, lanes, shape, dtype, stack, form == "compressed", device=device)
+
+
 def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator, operations: int) -> None:
     """Random pushes, terminations, truncations and cuts, into both."""
     shape = lanes[0].shape
@@ -81,11 +93,10 @@ def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator,
 def compare(replay: FrameReplay, lanes: list[NaiveLane]) -> None:
     replay.check_valid()
     batch = replay.gather(replay.valid_slots())
+    observations, following = np.asarray(batch.observations), np.asarray(batch.next_observations)
     ours = {
         (o.tobytes(), int(a), float(r), bool(t), n.tobytes())
-        for o, a, r, t, n in zip(
-            batch.observations, batch.actions, batch.rewards, batch.terminated, batch.next_observations, strict=True
-        )
+        for o, a, r, t, n in zip(observations, batch.actions, batch.rewards, batch.terminated, following, strict=True)
     }
     naive = {
         (t["observation"].tobytes(), t["action"], float(np.float32(t["reward"])), t["terminated"], t["next"].tobytes())
@@ -103,24 +114,22 @@ def compare(replay: FrameReplay, lanes: list[NaiveLane]) -> None:
     stack=st.integers(1, 5),
     operations=st.integers(0, 1000),
     seed=st.integers(0, 2**31),
-    compressed=st.booleans(),
+    form=st.sampled_from(FORMS),
 )
-def test_equals_naive_list(
-    num_lanes: int, slots: int, stack: int, operations: int, seed: int, compressed: bool
-) -> None:
+def test_equals_naive_list(num_lanes: int, slots: int, stack: int, operations: int, seed: int, form: str) -> None:
     shape = (2, 3)
-    replay = FrameReplay(slots * num_lanes, num_lanes, shape, np.uint8, stack, compressed)
+    replay = ring(form, slots * num_lanes, num_lanes, shape, stack)
     lanes = [NaiveLane(slots, stack, shape) for _ in range(num_lanes)]
     drive(replay, lanes, np.random.default_rng(seed), operations)
     compare(replay, lanes)
 
 
-@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("slots", [700, SEGMENT_SLOTS, 2500])
-def test_stored_and_loaded_is_the_same(slots: int, compressed: bool) -> None:
+def test_stored_and_loaded_is_the_same(slots: int, form: str) -> None:
     """Segments of an older moment plus those written since give the ring back, also after it went round."""
     shape = (1, 2)
-    replay = FrameReplay(2 * slots, 2, shape, np.uint8, 4, compressed)
+    replay = ring(form, 2 * slots, 2, shape, 4)
     lanes = [NaiveLane(slots, 4, shape) for _ in range(2)]
     rng = np.random.default_rng(0)
     stored: dict[Segment, np.ndarray] = {}
@@ -129,7 +138,7 @@ def test_stored_and_loaded_is_the_same(slots: int, compressed: bool) -> None:
         for segment in replay.segments():
             if segment not in stored or not segment.complete:
                 stored[segment] = replay.read_segment(segment).copy()
-    copy = FrameReplay(2 * slots, 2, shape, np.uint8, 4, compressed)
+    copy = ring(form, 2 * slots, 2, shape, 4)
     copy.load_state_dict(replay.state_dict())
     for segment in replay.segments():
         copy.load_segment(segment, stored[segment])
@@ -142,12 +151,13 @@ def test_stored_and_loaded_is_the_same(slots: int, compressed: bool) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.bool_, np.float32])
 @pytest.mark.parametrize("shape", [(1, 84, 84), (6, 10, 10), (4,)])
-def test_compressed_equals_plain(dtype: type, shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("form", ["compressed", "device"])
+def test_other_forms_equal_plain(dtype: type, shape: tuple[int, ...], form: str) -> None:
     """The same operations, samples and bytes, for frames that change little and for noise."""
-    plain, compressed = (FrameReplay(400, 2, shape, dtype, 4, c) for c in (False, True))
+    plain, other = (ring(name, 400, 2, shape, 4, dtype) for name in ("plain", form))
     rng = np.random.default_rng(0)
     frames = [rng.integers(0, 2, shape).astype(dtype) * rng.normal(size=shape).astype(dtype) for _ in range(40)]
-    for replay in (plain, compressed):
+    for replay in (plain, other):
         script = np.random.default_rng(1)
         for lane in range(2):
             replay.begin(lane, frames[0])
@@ -157,12 +167,12 @@ def test_compressed_equals_plain(dtype: type, shape: tuple[int, ...]) -> None:
             if end:
                 replay.begin(lane, frames[1])
             if step in (5, 100, 1199):
-                kept = replay.sample(50, np.random.default_rng(step))
-                other = plain.sample(50, np.random.default_rng(step)) if step == 1199 else kept
-                for one, two in zip(vars(kept).values(), vars(other).values(), strict=True):
+                ours = replay.sample(50, np.random.default_rng(step))
+                theirs = plain.sample(50, np.random.default_rng(step)) if step == 1199 else ours
+                for one, two in zip(vars(ours).values(), vars(theirs).values(), strict=True):
                     assert np.array_equal(one, two)
-                    assert one.dtype == two.dtype
-    compressed.check_valid()
+                    assert np.asarray(one).dtype == np.asarray(two).dtype
+    other.check_valid()
 
 
 def test_noise_stays_below_the_cap_and_what_is_left_is_right() -> None:

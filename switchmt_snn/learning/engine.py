@@ -53,7 +53,7 @@ def make_evaluate(
     Args:
         network: Q; read at every call.
         target: Q*; likewise.
-        engine: ``native``, ``compiled``, or anything else for eager.
+        engine: ``native``, ``compiled``, ``graph`` (compiled, for a CUDA graph), or anything else for eager.
         precision: see :func:`~switchmt_snn.spiking.network.synaptic_products`.
         double_q: whether Q chooses the next action.
         group: the processes among which a batch is divided (eager only).
@@ -81,7 +81,7 @@ def make_evaluate(
                 choice_BA = network.decide(x_choice, context, precision=precision, training=False)
         return Values(trained(x, context), next_BA, choice_BA)
 
-    run = _compiled(values) if engine == "compiled" else values
+    run = _compiled(values) if engine in ("compiled", "graph") else values
 
     def evaluate(observation: Tensor, following: Tensor, task: int, generator: torch.Generator) -> Values:
         context, target_context = network.context(task), target.context(task)

@@ -34,8 +34,9 @@ class FrameStore(Protocol):
     def drop(self, lane: int, within: int) -> None:
         """Forget the block that holds a slot."""
 
-    def read(self, slots: Slots) -> Frames:
-        """Frames ``[*slots.shape, *frame_shape]``; what was never written or dropped is undefined."""
+    def read(self, slots: Slots) -> Any:
+        """Frames ``[*slots.shape, *frame_shape]``, an array or a tensor; what was never written or dropped is
+        undefined."""
 
 
 class PlainFrames:

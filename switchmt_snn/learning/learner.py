@@ -15,7 +15,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from switchmt_snn.config import LearningConfig
+from switchmt_snn.learning.device_frames import to_device
 from switchmt_snn.learning.engine import make_evaluate
+from switchmt_snn.learning.graph import DeviceBatch, GraphedStep, Step
 from switchmt_snn.learning.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.state import Stateful
@@ -51,7 +53,7 @@ class Learner(Stateful):
     """
 
     SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
-    DERIVED = ("config", "device", "_evaluate", "_group", "_invalid_KA")
+    DERIVED = ("config", "device", "_evaluate", "_group", "_invalid_KA", "_step")
 
     def __init__(
         self,
@@ -80,9 +82,14 @@ class Learner(Stateful):
         self._group = group
         self._evaluate = make_evaluate(self.network, self.target, config.engine, precision, config.double_q, group)
         self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=config.learning_rate, eps=config.adam_epsilon, fused=True
+            self.network.parameters(),
+            lr=config.learning_rate,
+            eps=config.adam_epsilon,
+            fused=True,
+            capturable=config.engine == "graph",
         )
         self.generator = torch.Generator(device).manual_seed(seed)
+        self._step = self._make_step()
         self.updates = 0
         self._invalid_KA = torch.as_tensor(~valid_actions_KA, device=device)
         self.loss_sum = torch.zeros((), device=device)
@@ -104,17 +111,27 @@ class Learner(Stateful):
             batch = self._group.deal(batch)
         self._gradient_step(batch, task)
 
+    def _make_step(self) -> Step:
+        if self.config.engine == "graph":
+            return GraphedStep(self._device_step, self.optimizer, self.generator)
+        return self._device_step
+
     def _gradient_step(self, batch: Batch, task: int) -> None:
-        config = self.config
-        observations, next_observations = self._tensor(batch.observations), self._tensor(batch.next_observations)
-        rewards_B = self._tensor(batch.rewards)
+        parts = (batch.observations, batch.actions, batch.rewards, batch.next_observations, batch.terminated)
+        self._step(DeviceBatch(*(self._tensor(part) for part in parts)), task)
+        self.updates += 1
+        self.summed += 1
+
+    def _device_step(self, batch: DeviceBatch, task: int) -> None:
+        """All of an update that happens on the device; nothing here may read a number back to the host."""
+        config, rewards_B = self.config, batch.rewards_B
         if config.clip_rewards:
             rewards_B = rewards_B.clamp(-1.0, 1.0)
-        q_BA, q_next_BA, q_choice_BA = self._evaluate(observations, next_observations, task, self.generator)
+        q_BA, q_next_BA, q_choice_BA = self._evaluate(batch.observations, batch.next_observations, task, self.generator)
         with torch.no_grad():
             q_choice_BA = q_choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
-            target_B = td_target(rewards_B, self._tensor(batch.terminated), q_next_BA, q_choice_BA, config.discount)
-        q_B = q_BA.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
+            target_B = td_target(rewards_B, batch.terminated_B, q_next_BA, q_choice_BA, config.discount)
+        q_B = q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
         loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -123,13 +140,11 @@ class Learner(Stateful):
         elif config.gradient_clip == "norm":
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip_at)
         self.optimizer.step()
-        self.updates += 1
         means_2 = torch.stack([loss.detach(), q_B.detach().mean()])
         if self._group is not None:
             means_2 = self._group.sum(means_2) / self._group.size
         self.loss_sum += means_2[0]
         self.q_sum += means_2[1]
-        self.summed += 1
 
     def copy_target(self) -> None:
         """Q* <- Q, running statistics included."""
@@ -147,6 +162,7 @@ class Learner(Stateful):
         numbered = {int(number): values for number, values in optimizer["state"].items()}
         state = {**state, "optimizer": {**optimizer, "state": numbered}}
         super().load_state_dict(state)
+        self._step = self._make_step()  # the optimiser's tensors are others now
         if self._group is not None and self._group.rank == 0:
             self._group.announce(LOAD)
             self._group.share(state)
@@ -189,7 +205,7 @@ class Learner(Stateful):
             finite = finite & torch.isfinite(parameter).all()
         return bool(finite)
 
-    def firing_rates(self, observations: npt.NDArray[np.generic], task: int) -> dict[str, Tensor]:
+    def firing_rates(self, observations: npt.NDArray[np.generic] | Tensor, task: int) -> dict[str, Tensor]:
         """Mean activity of every neuron over T and batch, by layer ``[neurons]`` (spikes per step, or ReLU output).
 
         Draws its own random numbers, so looking does not change training.
@@ -201,5 +217,5 @@ class Learner(Stateful):
             self.network(self._tensor(observations), task, activity=activity, generator=generator)
         return {name: spikes.mean(dim=(0, 1)).flatten() for name, spikes in activity.items()}
 
-    def _tensor(self, array: npt.NDArray[np.generic]) -> Tensor:
-        return torch.from_numpy(array).to(self.device)
+    def _tensor(self, array: npt.NDArray[np.generic] | Tensor) -> Tensor:
+        return array if isinstance(array, Tensor) else to_device(array, self.device)

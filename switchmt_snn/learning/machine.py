@@ -47,7 +47,7 @@ def settle(
         the config, and what the user should know about the choice.
 
     Raises:
-        ConfigError: ``compiled`` or ``native`` is asked for and cannot be had here, or the batch cannot be divided.
+        ConfigError: an engine is asked for that cannot be had here, or the batch cannot be divided.
     """
     learning = config.learning
     precision, engine = learning.precision, learning.engine
@@ -63,6 +63,11 @@ def settle(
     if processes > 1:
         _require_divisible(config, processes)
         engine = "eager"
+    if engine == "graph" and device.type != "cuda":
+        raise ConfigError(
+            f"learning.engine is 'graph', expected a run on a CUDA device, this one is on device {device.type}; use "
+            "learning.engine=auto"
+        )
     if engine == "native" or (engine == "auto" and native_pays(config, precision, device)):
         obstacle = native_obstacle(config, device)
         if obstacle is not None and engine == "native":
@@ -92,7 +97,12 @@ def settle(
 
 
 def _require_divisible(config: ExperimentConfig, processes: int) -> None:
-    if config.learning.engine in ("compiled", "native"):
+    if config.learning.replay_on_device:
+        raise ConfigError(
+            f"learning.replay_on_device is True, expected False for the {processes} processes that torchrun started: "
+            "batches are dealt out from the host"
+        )
+    if config.learning.engine not in ("auto", "eager"):
         raise ConfigError(
             f"learning.engine is {config.learning.engine!r}, expected eager or auto for the {processes} processes that "
             "torchrun started"

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import torch
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.machine import select_device
 from switchmt_snn.spiking.network import QNetwork, trainable_parameters
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -50,7 +52,9 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
     """
     slots = config.learning.replay_capacity_steps * len(suite.names)
     frames = plain_frame_bytes(config, suite)
-    if compresses_replay(config, suite):
+    if lies_on_gpu(config):
+        frames = 0
+    elif compresses_replay(config, suite):
         frames = int(min(frames / COMPRESSION, config.learning.replay_max_gib * GIB))
     parameters = trainable_parameters(network) * 4
     snapshots = config.switching.window_episodes + 2 if config.switching.policy.startswith("parameter") else 0
@@ -74,9 +78,33 @@ def plain_frame_bytes(config: ExperimentConfig, suite: TaskSuite) -> int:
     return frame * config.learning.replay_capacity_steps * len(suite.names)
 
 
+def lies_on_gpu(config: ExperimentConfig) -> bool:
+    """Whether frames take no memory of the host."""
+    return config.learning.replay_on_device and select_device(config.device).type == "cuda"
+
+
+def require_gpu_memory(config: ExperimentConfig, suite: TaskSuite) -> None:
+    """Refuse a run whose frames do not fit on the GPU that they shall lie on.
+
+    Raises:
+        ConfigError: with the numbers and what to do.
+    """
+    if not lies_on_gpu(config):
+        return
+    needed, available = plain_frame_bytes(config, suite), torch.cuda.mem_get_info()[0]
+    if needed > available:
+        raise ConfigError(
+            f"the replay's frames need {needed / GIB:.1f} GiB on the GPU, expected at most the "
+            f"{available / GIB:.1f} GiB that are free; lower learning.replay_capacity_steps, or use "
+            "learning.replay_on_device=false"
+        )
+
+
 def compresses_replay(config: ExperimentConfig, suite: TaskSuite) -> bool:
     """Whether frames are kept compressed."""
     asked = config.learning.replay_compression
+    if config.learning.replay_on_device:
+        return False
     return asked == "zstd" or (asked == "auto" and plain_frame_bytes(config, suite) > GIB)
 
 

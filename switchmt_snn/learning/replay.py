@@ -7,7 +7,8 @@ frame is the next slot's. The last frame of an episode has a slot of its own wit
 is right at termination and truncation, and no stack crosses an episode border (frames before the start are zeros).
 
 Old frames leave in blocks of a few slots: when the first slot of a block is overwritten, and the oldest while frames
-take more bytes than they may. Frames lie plain or compressed (:mod:`switchmt_snn.learning.frames`), else all is alike.
+take more bytes than they may. Frames lie plain or compressed (:mod:`switchmt_snn.learning.frames`), or on
+the learner's device (:mod:`switchmt_snn.learning.device_frames`); else all is alike.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
+from switchmt_snn.learning.device_frames import DeviceFrames
 from switchmt_snn.learning.frames import CompressedFrames, FrameStore, PlainFrames
 
 BLOCK_SLOTS = 16
@@ -29,12 +33,13 @@ SEGMENT_SLOTS = 1024
 
 @dataclass(frozen=True)
 class Batch:
-    """Sampled transitions of one task; observations are stacked ``[B, k*c, ...]``, rewards raw."""
+    """Sampled transitions of one task; observations are stacked ``[B, k*c, ...]`` (tensors where frames lie on the
+    learner's device), rewards raw."""
 
-    observations: npt.NDArray[Any]
+    observations: npt.NDArray[Any] | Tensor
     actions: npt.NDArray[np.int64]
     rewards: npt.NDArray[np.float32]
-    next_observations: npt.NDArray[Any]
+    next_observations: npt.NDArray[Any] | Tensor
     terminated: npt.NDArray[np.bool_]
 
 
@@ -65,6 +70,7 @@ class FrameReplay:
         stack: int,
         compressed: bool = False,
         max_bytes: int | None = None,
+        device: torch.device | None = None,
     ) -> None:
         """Reserve the ring; the system hands out its memory as frames come in.
 
@@ -76,6 +82,7 @@ class FrameReplay:
             stack: frames k per observation.
             compressed: keep frames compressed, without loss.
             max_bytes: the oldest blocks leave while compressed frames take more.
+            device: keep frames in a tensor there, and sample observations as tensors there; not compressed.
         """
         self.stack = stack
         self.slots = capacity_steps // num_lanes
@@ -84,11 +91,12 @@ class FrameReplay:
         # A ring of few slots cannot do without many of them at once.
         self.block_slots = BLOCK_SLOTS if self.slots >= 8 * BLOCK_SLOTS else 1
         self.max_bytes = max_bytes if compressed else None
-        self._frames: FrameStore = (
-            CompressedFrames(num_lanes, self.slots, frame_shape, dtype, self.block_slots)
-            if compressed
-            else PlainFrames(num_lanes, self.slots, frame_shape, dtype)
-        )
+        form = (num_lanes, self.slots, frame_shape, dtype)
+        self._frames: FrameStore
+        if compressed:
+            self._frames = CompressedFrames(*form, self.block_slots)
+        else:
+            self._frames = PlainFrames(*form) if device is None else DeviceFrames(*form, device)
         flat = self.slots * num_lanes
         self._actions = np.full(flat, -1, np.int16)
         self._rewards = np.zeros(flat, np.float32)
@@ -247,7 +255,8 @@ class FrameReplay:
         written, oldest = int(self._written[segment.lane]), int(self._oldest[segment.lane])
         start = segment.number * SEGMENT_SLOTS
         positions = np.arange(start, min(start + SEGMENT_SLOTS, written))
-        return self._frames.read(np.where(positions < oldest, -1, self._slot(segment.lane, positions)))
+        frames = self._frames.read(np.where(positions < oldest, -1, self._slot(segment.lane, positions)))
+        return frames.cpu().numpy() if isinstance(frames, Tensor) else frames
 
     def load_segment(self, segment: Segment, frames: npt.NDArray[Any]) -> None:
         """Put the frames of a segment back that are still held; a lane's segments must come in order."""

@@ -22,7 +22,7 @@ from switchmt_snn.learning.description import describe_method
 from switchmt_snn.learning.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.machine import keep_freed_memory, select_device, settle
-from switchmt_snn.learning.memory import require_memory
+from switchmt_snn.learning.memory import require_gpu_memory, require_memory
 from switchmt_snn.learning.processes import ProcessGroup, join_processes
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.run_folder import (
@@ -122,6 +122,7 @@ def _train(
         torch.set_num_threads(config.threads)
     keep_freed_memory()
     require_memory(describe_method(config, suite).memory, config)
+    require_gpu_memory(config, suite)
     lock = folder.lock()
     try:
         if stored is None:

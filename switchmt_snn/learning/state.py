@@ -54,6 +54,8 @@ def _unpacked(current: Any, saved: Any) -> Any:
     if hasattr(current, "load_state_dict"):
         current.load_state_dict(saved)
         return current
+    if isinstance(current, torch.Tensor):  # stays on its device
+        return current.copy_(saved)
     if isinstance(current, list) and current and hasattr(current[0], "load_state_dict"):
         for index, item in enumerate(current):
             item.load_state_dict(saved[str(index)])

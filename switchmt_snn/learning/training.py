@@ -108,6 +108,7 @@ class Training(Stateful):
                 suite.frame_stack,
                 compresses_replay(config, suite),
                 int(learning.replay_max_gib * GIB / num_tasks),
+                device if learning.replay_on_device else None,
             )
             for _ in suite.names
         ]
