@@ -38,7 +38,8 @@ OURS: dict[str, dict[str, Any]] = {
     "ours, default": {"engine": "eager"},
     "ours, compiled": {"engine": "compiled"},
     "ours, compiled, bfloat16": {"engine": "compiled", "precision": "bfloat16"},
-    "ours, compiled, bfloat16, overlap": {"engine": "compiled", "precision": "bfloat16", "overlap": True},
+    "ours, native, bfloat16": {"engine": "native", "precision": "bfloat16"},
+    "ours, native, bfloat16, overlap": {"engine": "native", "precision": "bfloat16", "overlap": True},
 }
 
 

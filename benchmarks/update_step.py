@@ -1,7 +1,10 @@
 """One gradient step, ours against peers, interleaved in one process: double DQN, dueling network with dendrites, Adam.
 
-``python -m benchmarks.update_step [--batch 32] [--timesteps 4] [--repeats 15] [--device cpu] [--json]``. All variants
-have the same layers and the same random batch. SpikingJelly takes part where it is installed (extra ``simulators``).
+``python -m benchmarks.update_step [--batch 32] [--timesteps 4] [--repeats 15] [--device cpu] [--only TEXT ...]
+[--hand-memory-back] [--json]``. All variants have the same layers and the same random batch. SpikingJelly takes part
+where it is installed (extra ``simulators``); on a GPU it chooses its kernels itself. There, batches lie on the device,
+ours runs as a CUDA graph, too, every variant's peak of memory is given, and one that fails is told with its reason and
+left out.
 
 The physical limit of a variant is the time of its products alone (forward for Q*, Q and training, backward for weights
 and inputs; the first layer once for all T) at the speed of a large matrix product of its precision on this machine.
@@ -51,7 +54,7 @@ class PeerUpdate:
 
     def load(self, batch: Batch) -> None:
         """Take the next batch."""
-        tensors = (torch.from_numpy(getattr(batch, field.name)).to(self.device) for field in fields(Batch))
+        tensors = (torch.as_tensor(getattr(batch, field.name)).to(self.device) for field in fields(Batch))
         x, actions, self.rewards, x_next, self.terminated = tensors
         self.x, self.x_next, self.actions = x.float() / 255, x_next.float() / 255, actions[:, None]
 
@@ -82,7 +85,8 @@ def our_learner(config: ExperimentConfig, suite: TaskSuite, device: str) -> Lear
 
 def update_gigaoperations(learner: Learner, batch: Batch) -> float:
     """Operations of an update's products in 1e9, two for a multiply-accumulate."""
-    macs = network_macs(learner.network, lambda: learner.act(batch.observations, 0))
+    observations = np.asarray(torch.as_tensor(batch.observations).cpu())
+    macs = network_macs(learner.network, lambda: learner.act(observations, 0))
     forward, first = sum(macs.values()), next(iter(macs.values()))
     return 2e-9 * (3 * forward + 2 * forward - first)  # no gradient for the observations
 
@@ -95,6 +99,9 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
     frames = rng.integers(0, 256, (2, batch_size, *suite.observation_shape), np.uint8)
     rewards = rng.normal(size=batch_size).astype(np.float32)
     batch = Batch(frames[0], rng.integers(0, ACTIONS, batch_size), rewards, frames[1], np.zeros(batch_size, np.bool_))
+    if device == "cuda":  # as with learning.replay_on_device
+        x, x_next = torch.from_numpy(frames).to(device)
+        batch = replace(batch, observations=x, next_observations=x_next)
     torch.manual_seed(0)
     gflops = {name: matmul_gflops(getattr(torch, name), device) for name in ("float32", "bfloat16")}
     steps: dict[str, Callable[[], None]] = {PLAIN: PeerUpdate(PlainLoop(timesteps), batch, False, device)}
@@ -108,9 +115,9 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
     work = {}
     for method, label in (("SwitchMT", "ours"), ("DQN_D", "our ANN of the same shape")):
         for precision in gflops:
-            for engine in ("eager", "native", "compiled"):
-                if engine == "native" and (device != "cpu" or method == "DQN_D"):
-                    continue  # made for spikes on a CPU
+            for engine in ("eager", "compiled", "graph" if device == "cuda" else "native"):
+                if engine == "native" and method == "DQN_D":
+                    continue  # made for spikes
                 config = replace(
                     base,
                     network=replace(base.network, method=method, timesteps=timesteps),
@@ -125,11 +132,20 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
     return steps, limits
 
 
-def measure(batch_size: int, timesteps: int, repeats: int, device: str = "cpu") -> dict[str, Any]:
-    """All variants, interleaved."""
+def measure(batch_size: int, timesteps: int, repeats: int, device: str, only: list[str]) -> dict[str, Any]:
+    """The plain loop and all variants (or those whose name has one of the texts in it), interleaved."""
     steps, limits = variants(batch_size, timesteps, device)
+    if only:
+        steps = {name: step for name, step in steps.items() if name == PLAIN or any(text in name for text in only)}
+    failed, peaks_mib = {}, {}
     if device == "cuda":
-        steps = {name: functools.partial(_synchronized, step) for name, step in steps.items()}
+        for name, step in list(steps.items()):
+            steps[name] = functools.partial(_synchronized, step)
+            try:
+                peaks_mib[name] = _peak_mib(steps[name])
+            except Exception as error:
+                failed[name] = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+                del steps[name]
     times = interleaved_ms(steps, repeats, warmup=4)
     slowest = statistics.median(times[PLAIN])
     rows = {
@@ -137,11 +153,22 @@ def measure(batch_size: int, timesteps: int, repeats: int, device: str = "cpu") 
             **summary(values),
             "faster_than_plain_loop": slowest / statistics.median(values),
             "limit_ms": limits[name],
+            **({"peak_mib": peaks_mib[name]} if name in peaks_mib else {}),
         }
         for name, values in times.items()
     }
     facts = {"batch": batch_size, "timesteps": timesteps, "repeats": repeats, "device": device}
-    return {**facts, "variants": rows, "environment": environment()}
+    return {**facts, "variants": rows, **({"failed": failed} if failed else {}), "environment": environment()}
+
+
+def _peak_mib(step: Callable[[], None]) -> float:
+    """What a variant takes of the device's memory beyond what all of them hold."""
+    for _ in range(6):  # compiles, captures
+        step()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    step()
+    return (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
 def _synchronized(step: Callable[[], None]) -> None:
@@ -156,12 +183,15 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--only", nargs="*", default=[], metavar="TEXT", help="variants with such a text in their name")
+    parser.add_argument("--hand-memory-back", action="store_true", help="leave the C library's memory settings alone")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device is cuda, expected a machine with a CUDA device and a torch built for it; use cpu")
-    keep_freed_memory()  # as `train` does
-    result = measure(options.batch, options.timesteps, options.repeats, options.device)
+    if not options.hand_memory_back:
+        keep_freed_memory()  # as `train` does
+    result = measure(options.batch, options.timesteps, options.repeats, options.device, options.only)
     if options.json:
         print(json.dumps(result, indent=1))
         return
@@ -170,7 +200,10 @@ def main() -> None:
         print(
             f"{name:38}{row['median_ms']:10.1f}{row['min_ms']:8.1f}{row['max_ms']:8.1f}"
             f"{row['faster_than_plain_loop']:9.2f}{row['limit_ms']:8.1f}"
+            + (f"  {row['peak_mib']:,.0f} MiB" if "peak_mib" in row else "")
         )
+    for name, reason in result.get("failed", {}).items():
+        print(f"{name:38} failed: {reason}")
 
 
 if __name__ == "__main__":

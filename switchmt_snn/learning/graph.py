@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from switchmt_snn.errors import TrainingFailed
+
 WARMUP_UPDATES = 3
 """Updates before the first capture: compilation, autotuning and the optimiser's state come with them."""
 
@@ -73,6 +75,12 @@ class GraphedStep:
         graph = torch.cuda.CUDAGraph()
         graph.register_generator_state(self._generator)
         # Other threads may send frames meanwhile: what they call is no concern of this capture.
-        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
-            self._step(batch, task)
+        try:
+            with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+                self._step(batch, task)
+        except RuntimeError as error:
+            raise TrainingFailed(
+                f"an update cannot be captured as a CUDA graph ({str(error).splitlines()[0]}), expected one on this "
+                "device; use learning.engine=compiled"
+            ) from error
         return graph
