@@ -41,6 +41,7 @@ def performance_page() -> str:
         *loop_part(results["end_to_end"], results["environments"]),
         *scaling_part(results["scaling"]),
         *replay_part([results["replay"], results["replay_agent"]]),
+        *sampling_part([results["replay"], results["replay_agent"]], results["update_step"], results["update_512"]),
         *fast_part(results["environments"], results["replay"]),
     ]
     return "\n".join(lines) + "\n"
@@ -243,6 +244,23 @@ def replay_part(replays: list[dict[str, Any]]) -> list[str]:
         lines.append(f"{replay['policy']}: mean {mean:.0f} bytes; 3 x 2^20 transitions take {total:.2f} GiB.  ")
     floats = replays[0]["layouts_bytes_per_transition"]["two stacks of float32"]
     return [*lines, f"Two stacks of float32, as the authors' script keeps them, would take {floats:,} bytes."]
+
+
+def sampling_part(replays: list[dict[str, Any]], *updates: dict[str, Any]) -> list[str]:
+    """The slowest sampling beside the fastest update of its batch."""
+    lines = [""]
+    for update in updates:
+        size = update["batch"]
+        slowest = max(
+            game["compressed"][f"sample_{size}"]["median_ms"] for replay in replays for game in replay["games"].values()
+        )
+        ours = {name: row["median_ms"] for name, row in update["variants"].items() if name.startswith("ours")}
+        fastest = min(ours, key=lambda name: ours[name])
+        lines.append(
+            f"The slowest compressed sampling of {size} takes {slowest / ours[fastest]:.1%} of the fastest update of "
+            f"{size} ({fastest.removeprefix('ours, ')}).  "
+        )
+    return lines
 
 
 def fast_part(environments: dict[str, Any], replay: dict[str, Any]) -> list[str]:

@@ -18,7 +18,7 @@ from switchmt_snn.config_io import load_config
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning import machine
 from switchmt_snn.learning.engine import make_evaluate
-from switchmt_snn.spiking import native
+from switchmt_snn.spiking import native_library
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from tests.conftest import small_config
 
@@ -77,7 +77,7 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
     _compare_to_rounding("compiled", network)
 
 
-@pytest.mark.skipif(native.problem() is not None, reason="no C++ compiler")
+@pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
 @pytest.mark.parametrize(
     "network",
     [

@@ -18,14 +18,14 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning import machine
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.replay import Batch
-from switchmt_snn.spiking import native
+from switchmt_snn.spiking import native_library
 from switchmt_snn.spiking.native import Neurons, batch_moments, scaled_images
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.spiking.neurons import SpikingLayer
 from tests.conftest import small_config
 
 CPU = torch.device("cpu")
-builds = pytest.mark.skipif(native.problem() is not None, reason="no C++ compiler")
+builds = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
 FORMS = {
     "neuron": st.sampled_from(["IF", "LIF"]),
     "reset": st.sampled_from(["zero", "subtract"]),
@@ -196,24 +196,24 @@ def test_auto_is_native_in_bfloat16_on_the_nature_trunk(monkeypatch: pytest.Monk
 @builds
 def test_it_is_built_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    built = native._compile()
+    built = native_library.compiled()
     assert built.parent == tmp_path / "switchmt_snn"
     assert [path.name for path in built.parent.iterdir()] == [built.name]
     changed = built.stat().st_mtime_ns
-    assert native._compile().stat().st_mtime_ns == changed
+    assert native_library.compiled().stat().st_mtime_ns == changed
 
 
 def test_no_compiler_and_a_failing_one_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native._library.cache_clear()
+    native_library.library.cache_clear()
     try:
         monkeypatch.setenv("CXX", "no-such-compiler")
-        assert native.problem() == "no C++ compiler 'no-such-compiler'"
+        assert native_library.problem() == "no C++ compiler 'no-such-compiler'"
         script = tmp_path / "failing"
         script.write_text("#!/bin/sh\n[ $1 = --version ] && exit 0\necho unhappy >&2\nexit 1\n")
         script.chmod(0o755)
         monkeypatch.setenv("CXX", str(script))
-        assert native.problem() == "unhappy"
+        assert native_library.problem() == "unhappy"
         assert [path.name for path in (tmp_path / "switchmt_snn").iterdir()] == []
         asked = small_config(learning={"engine": "native"})
         with pytest.raises(
@@ -221,4 +221,4 @@ def test_no_compiler_and_a_failing_one_are_one_line(tmp_path: Path, monkeypatch:
         ):
             machine.settle(asked, None, CPU)
     finally:
-        native._library.cache_clear()
+        native_library.library.cache_clear()

@@ -9,7 +9,7 @@ import torch
 
 from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.spiking import native
+from switchmt_snn.spiking import native, native_library
 
 COMPILE_FROM_UPDATES = 150_000
 """``engine=auto`` compiles runs of at least this many updates: a minute at the start, minutes to hours back."""
@@ -142,7 +142,7 @@ def native_obstacle(config: ExperimentConfig, device: torch.device) -> str | Non
     setting = native.unsupported(config.network, METHOD_TRAITS[config.network.method].spiking)
     if setting is not None:
         return f"which has no code for {setting}"
-    problem = native.problem()
+    problem = native_library.problem()
     if problem is not None:
         return f"expected a C++ compiler that builds it (Debian: apt install g++), but: {problem}"
     return None
@@ -169,7 +169,7 @@ def compile_problem() -> str | None:
 
 def built_engines() -> dict[str, str]:
     """What of the engines that need a C++ compiler works here, and what goes wrong with the others."""
-    return {"torch_compile": compile_problem() or "works", "native_engine": native.problem() or "works"}
+    return {"torch_compile": compile_problem() or "works", "native_engine": native_library.problem() or "works"}
 
 
 def keep_freed_memory() -> bool:

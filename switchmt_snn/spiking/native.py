@@ -1,56 +1,23 @@
 """Neuron layers in C++ (``native.cpp``), for updates on a CPU: the currents' scale and shift, T steps of neurons, and
 all their gradients take two passes over memory, where single operations take some thirty.
 
-The source is compiled by the machine's C++ compiler at its first use, for the processor at hand, and kept in the user's
-cache. The parallel loops run in PyTorch's own pool of threads.
-
 Shapes: S steps of the currents (T, or 1 that all steps share), T steps of the spikes, R rows, C channels.
 """
 
 from __future__ import annotations
 
 import ctypes
-import functools
-import hashlib
-import os
-import platform
-import shutil
-import subprocess
-import tempfile
-from contextlib import suppress
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
+from switchmt_snn.spiking.native_library import library
 from switchmt_snn.spiking.neurons import DEFAULT_SLOPE
 
-_SOURCE = Path(__file__).with_suffix(".cpp")
-# No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
-_FLAGS = (
-    "-std=c++17",
-    "-O3",
-    "-march=native",
-    "-ffp-contract=off",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fopenmp",
-    "-fPIC",
-)
 _SURROGATES = ("atan", "fast_sigmoid")
 """Those that ``native.cpp`` has."""
-
-_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_long, "f": ctypes.c_float}
-_ARGUMENTS = {
-    "snn_fire": "ppilpppillli",
-    "snn_unfire": "ppilppppilppllli",
-    "snn_combine": "ppippppplli",
-    "snn_moments": "pipplli",
-    "snn_images": "pfpillli",
-}
-"""Pointers, ints, longs and floats that the functions of ``native.cpp`` take."""
 
 
 class _Neuron(ctypes.Structure):
@@ -74,62 +41,6 @@ def unsupported(config: NetworkConfig, spiking: bool) -> str | None:
     if config.k_winners is not None:
         return "network.k_winners"
     return "network.neuron_engine=snntorch" if config.neuron_engine == "snntorch" else None
-
-
-def problem() -> str | None:
-    """One line on why ``native.cpp`` cannot be compiled and loaded here; None if it can."""
-    try:
-        _library()
-    except (OSError, subprocess.SubprocessError) as error:
-        output = getattr(error, "stderr", None) or str(error)
-        return str(output).strip().splitlines()[0][:120]
-    return None
-
-
-@functools.cache
-def _library() -> ctypes.CDLL:
-    library = ctypes.CDLL(str(_compile()))
-    for name, kinds in _ARGUMENTS.items():
-        function = getattr(library, name)
-        function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
-    return library
-
-
-def _compile() -> Path:
-    """The compiled library, made if the cache has none for this source, compiler and processor."""
-    compiler = shutil.which(os.environ.get("CXX", "g++"))
-    if compiler is None:
-        raise OSError(f"no C++ compiler {os.environ.get('CXX', 'g++')!r}")
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True).stdout
-    what = [_SOURCE.read_text(), version, " ".join(_FLAGS), platform.machine(), _instructions()]
-    name = f"native-{hashlib.sha256(chr(0).join(what).encode()).hexdigest()[:16]}.so"
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "switchmt_snn"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / name).exists():
-            return folder / name
-        scratch = Path(tempfile.mkdtemp(dir=folder))
-    except OSError:  # no home to write to
-        folder = scratch = Path(tempfile.mkdtemp())
-    try:
-        compiled, linked = scratch / "native.o", scratch / name
-        for command in ([*_FLAGS, "-c", str(_SOURCE), "-o", str(compiled)], ["-shared", str(compiled), "-o", linked]):
-            # Linked without OpenMP: its symbols are found in the one that PyTorch has loaded.
-            subprocess.run([compiler, *command], capture_output=True, text=True, check=True)
-        os.replace(linked, folder / name)
-    finally:
-        if scratch != folder:
-            shutil.rmtree(scratch, ignore_errors=True)
-    return folder / name
-
-
-def _instructions() -> str:
-    """What this processor can do, as far as the system tells: homes are shared by machines."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith(("flags", "Features")):
-                return line
-    return platform.processor()
 
 
 class Currents(NamedTuple):
@@ -182,7 +93,7 @@ class Neurons:
         """Spikes ``[T, R, C]``, without gradient."""
         _, rows, channels = y_SRC.shape
         spikes = torch.empty(self.timesteps, rows, channels, dtype=dtype)
-        _library().snn_fire(
+        library().snn_fire(
             ctypes.addressof(self._neuron),
             *_typed(y_SRC),
             _step(y_SRC),
@@ -203,7 +114,7 @@ class Neurons:
         sums_2C = torch.zeros(2, channels, dtype=torch.float64)
         if not (grad_TRC.stride(0) == 0 and grad_TRC[0].is_contiguous()):
             grad_TRC = grad_TRC.contiguous()
-        _library().snn_unfire(
+        library().snn_unfire(
             ctypes.addressof(self._neuron),
             *_typed(y_SRC),
             _step(y_SRC),
@@ -226,7 +137,7 @@ def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and biased variance of every channel ``[C]`` over steps and rows."""
     steps, rows, channels = y_SRC.shape
     mean_C, variance_C = torch.empty(channels), torch.empty(channels)
-    _library().snn_moments(
+    library().snn_moments(
         *_typed(y_SRC), mean_C.data_ptr(), variance_C.data_ptr(), steps * rows, channels, torch.get_num_threads()
     )
     return mean_C, variance_C
@@ -237,7 +148,7 @@ def scaled_images(x_BCHW: Tensor, scale: float, dtype: torch.dtype) -> Tensor:
     batch, channels, height, width = x_BCHW.shape
     x_BCHW = x_BCHW.contiguous()
     out_BHWC = torch.empty(batch, height, width, channels, dtype=dtype)
-    _library().snn_images(
+    library().snn_images(
         x_BCHW.data_ptr(), scale, *_typed(out_BHWC), batch, channels, height * width, torch.get_num_threads()
     )
     return out_BHWC.permute(0, 3, 1, 2)
@@ -280,7 +191,7 @@ class _Spikes(torch.autograd.Function):
             slope_C = currents.scale_C * currents.inverse_std_C * grad_a_C / -count
             constant_C = currents.scale_C * sum_C / -count
         grad_y_SRC = torch.empty_like(y_SRC)
-        _library().snn_combine(
+        library().snn_combine(
             grad_SRC.data_ptr(),
             *_typed(y_SRC),
             currents.scale_C.data_ptr(),
