@@ -123,6 +123,20 @@ def test_scaled_images_are_bitwise_those_of_torch(shape: tuple[int, ...], dtype:
 
 
 @builds
+def test_what_cplusplus_would_read_wrongly_is_refused() -> None:
+    neurons, ones = Neurons(NetworkConfig(timesteps=4)), torch.ones(8)
+    for y, dtype in (
+        (torch.zeros(4, 8, 5).transpose(1, 2), torch.float32),
+        (torch.zeros(3, 5, 8), torch.float32),
+        (torch.zeros(4, 5, 8), torch.bfloat16),
+        (torch.zeros(4, 5, 8, dtype=torch.float64), torch.float32),
+        (torch.zeros(4, 5, 8, device="meta"), torch.float32),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            neurons.gated(y, ones, dtype)
+
+
+@builds
 def test_any_number_of_threads_gives_the_same_bits() -> None:
     config = NetworkConfig(timesteps=4)
     y, g = torch.randn(4, 333, 48), torch.randn(4, 333, 48)

@@ -82,7 +82,8 @@ class Neurons:
     ) -> Tensor:
         """Spikes ``[T, R, C]`` for currents ``(y - mean) * inverse_std * weight + bias``.
 
-        ``of_batch``: mean and deviation are those of ``y`` itself, and the gradient goes through them.
+        ``of_batch``: mean and deviation are those of ``y`` itself, and the gradient goes through them; else there is no
+        gradient.
         """
         if of_batch and torch.is_grad_enabled():
             return _spikes(self, y_SRC, weight_C, bias_C, mean_C, inverse_std_C, y_SRC.dtype)
@@ -90,8 +91,17 @@ class Neurons:
         return self.fire(y_SRC, scale_C, bias_C.detach() - mean_C * scale_C, y_SRC.dtype)
 
     def fire(self, y_SRC: Tensor, scale_C: Tensor, shift_C: Tensor, dtype: torch.dtype) -> Tensor:
-        """Spikes ``[T, R, C]``, without gradient."""
-        _, rows, channels = y_SRC.shape
+        """Spikes ``[T, R, C]``, without gradient.
+
+        Raises:
+            ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``.
+        """
+        steps, rows, channels = y_SRC.shape
+        if not y_SRC.is_contiguous() or steps not in (1, self.timesteps) or dtype not in (torch.float32, y_SRC.dtype):
+            raise ValueError(
+                f"{y_SRC.dtype} {tuple(y_SRC.shape)} with strides {y_SRC.stride()} for spikes in {dtype}, expected "
+                f"contiguous currents of 1 or {self.timesteps} steps, and spikes in float32 or the currents' dtype"
+            )
         spikes = torch.empty(self.timesteps, rows, channels, dtype=dtype)
         library().snn_fire(
             ctypes.addressof(self._neuron),
@@ -221,7 +231,9 @@ def _spikes(
 
 
 def _typed(tensor: Tensor) -> tuple[int, int]:
-    """Where numbers lie, and whether they are bfloat16."""
+    """Where numbers lie, and whether they are bfloat16; ValueError for what C++ would read wrongly."""
+    if not tensor.is_cpu or tensor.dtype not in (torch.float32, torch.bfloat16):
+        raise ValueError(f"{tensor.dtype} on {tensor.device}, expected float32 or bfloat16 on the CPU")
     return tensor.data_ptr(), int(tensor.dtype == torch.bfloat16)
 
 
