@@ -13,6 +13,7 @@ from typing import Literal, get_args
 from switchmt_snn.errors import ConfigError
 
 Method = Literal["DQN", "DSQN", "DQN_D", "DSQN_D", "MTSpark_AD", "MTSpark_ADD", "SwitchMT"]
+Engine = Literal["eager", "native", "compiled", "graph"]
 Policy = Literal[
     "fixed_episodes",
     "fixed_steps",
@@ -209,7 +210,7 @@ class LearningConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
     """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
     has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
-    engine: Literal["auto", "eager", "native", "compiled", "graph"] = "auto"
+    engine: Literal["auto"] | Engine = "auto"
     """Updates operation by operation, with neuron layers in C++ (native: CPU; built once, some 5 s), compiled by
     torch.compile (20 to 35 s per start), or compiled into a CUDA graph; each rounds in its own way. auto, on a CPU with
     a C++ compiler: native for the nature trunk in bfloat16, compiled from 150,000 updates on; else eager."""
@@ -250,8 +251,7 @@ class LearningConfig:
         _require(0.0 <= self.discount <= 1.0, "learning.discount", self.discount, "within [0, 1]")
         _require(self.gradient_clip_at > 0, "learning.gradient_clip_at", self.gradient_clip_at, "above 0")
         if self.replay_on_device:
-            asked = self.replay_compression
-            _require(asked != "zstd", "learning.replay_compression", asked, "auto or none with replay_on_device")
+            _require(self.replay_compression != "zstd", "learning.replay_compression", "zstd", "none on a device")
         _require(self.replay_max_gib > 0, "learning.replay_max_gib", self.replay_max_gib, "above 0")
         for name in ("replay_capacity_steps", "update_every_steps", "target_update_every_steps", "epsilon_decay_steps"):
             value = getattr(self, name)

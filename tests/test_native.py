@@ -185,7 +185,7 @@ def test_the_target_is_rounded_anew_after_its_copy() -> None:
 )
 def test_what_it_has_no_code_for_is_refused_by_name(setting: dict[str, Any], named: str) -> None:
     asked = small_config(network=setting, learning={"engine": "native"})
-    with pytest.raises(ConfigError, match=f"learning.engine is 'native', which has no code for .*{named}.*eager"):
+    with pytest.raises(ConfigError, match=f"learning.engine is 'native', .*it has no code for .*{named}.*eager"):
         machine.settle(asked, None, CPU)
 
 
@@ -208,13 +208,36 @@ def test_auto_is_native_in_bfloat16_on_the_nature_trunk(monkeypatch: pytest.Monk
 
 
 @builds
-def test_it_is_built_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_built_once_and_kept_and_again_if_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    built = native_library.compiled()
-    assert built.parent == tmp_path / "switchmt_snn"
-    assert [path.name for path in built.parent.iterdir()] == [built.name]
-    changed = built.stat().st_mtime_ns
-    assert native_library.compiled().stat().st_mtime_ns == changed
+    build, folders = native_library._build, []
+
+    def counted(compiler: list[str], folder: Path) -> Path:
+        folders.append(folder)
+        return build(compiler, folder)
+
+    monkeypatch.setattr(native_library, "_build", counted)
+
+    def load() -> Path:
+        native_library.library.cache_clear()
+        assert native_library.problem() is None
+        (kept,) = (tmp_path / "switchmt_snn").iterdir()
+        return kept
+
+    try:
+        damaged = native_library._cache() / f"native-{native_library._key(native_library._compiler())}.so"
+        damaged.parent.mkdir()
+        damaged.write_bytes(b"not a library")
+        assert load() == load() == damaged
+        assert damaged.stat().st_size > 10_000
+        assert len(folders) == 1
+        monkeypatch.setenv("XDG_CACHE_HOME", "/proc/no-such-folder")
+        native_library.library.cache_clear()
+        assert native_library.problem() is None
+        assert not any(folder.exists() for folder in folders)
+        assert native_library._key(["g++"]) != native_library._key(["g++", "-g"])
+    finally:
+        native_library.library.cache_clear()
 
 
 def test_no_compiler_and_a_failing_one_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,11 +251,14 @@ def test_no_compiler_and_a_failing_one_are_one_line(tmp_path: Path, monkeypatch:
         script.chmod(0o755)
         monkeypatch.setenv("CXX", str(script))
         assert native_library.problem() == "unhappy"
-        assert [path.name for path in (tmp_path / "switchmt_snn").iterdir()] == []
+        assert not (tmp_path / "switchmt_snn").exists()
         asked = small_config(learning={"engine": "native"})
-        with pytest.raises(
-            ConfigError, match=r"'native', expected a C\+\+ compiler .*unhappy; use learning.engine=eager"
-        ):
+        with pytest.raises(ConfigError, match=r"a C\+\+ compiler .*\(unhappy\); use learning.engine=eager"):
             machine.settle(asked, None, CPU)
+        with pytest.raises(ConfigError, match=r"this run was begun, .*\(unhappy\); start another run \(--run OTHER"):
+            machine.settle(small_config(), asked, CPU)
+        for value in ('"g++', "no-such-compiler -g"):
+            monkeypatch.setenv("CXX", value)
+            assert str(native_library.problem()).startswith("no C++ compiler")
     finally:
         native_library.library.cache_clear()

@@ -78,9 +78,11 @@ class GraphedStep:
         try:
             with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
                 self._step(batch, task)
+        except torch.cuda.OutOfMemoryError:
+            raise
         except RuntimeError as error:
             raise TrainingFailed(
                 f"an update cannot be captured as a CUDA graph ({str(error).splitlines()[0]}), expected one on this "
-                "device; use learning.engine=compiled"
+                "device; start another run (--run OTHER --learning.engine compiled)"
             ) from error
         return graph

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import torch
 
-from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig
+from switchmt_snn.config import METHOD_TRAITS, Engine, ExperimentConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking import native, native_library
 
 COMPILE_FROM_UPDATES = 150_000
-"""``engine=auto`` compiles runs of at least this many updates: a minute at the start, minutes to hours back."""
+"""``engine=auto`` compiles runs of at least this many updates: half a minute at the start, minutes to hours back."""
 
 
 def select_device(wish: str) -> torch.device:
@@ -63,37 +63,43 @@ def settle(
     if processes > 1:
         _require_divisible(config, processes)
         engine = "eager"
-    if engine == "graph" and device.type != "cuda":
-        raise ConfigError(
-            f"learning.engine is 'graph', expected a run on a CUDA device, this one is on device {device.type}; use "
-            "learning.engine=auto"
-        )
+    engine, engine_notes = _settle_engine(engine, config, precision, device, begun=stored is not None)
+    return replace(config, learning=replace(learning, precision=precision, engine=engine)), notes + engine_notes
+
+
+def _settle_engine(
+    engine: str, config: ExperimentConfig, precision: str, device: torch.device, begun: bool
+) -> tuple[Engine, list[str]]:
+    """The engine for a wish, and what the user should know; ``begun``: a run that exists has it already."""
+
+    def unavailable(expected: str, seen: str) -> ConfigError:
+        remedy = "start another run (--run OTHER --learning.engine eager)" if begun else "use learning.engine=eager"
+        wish = f"learning.engine is {engine!r}" + (", with which this run was begun" if begun else "")
+        return ConfigError(f"{wish}, expected {expected}, but {seen}; {remedy}")
+
+    if engine == "graph":
+        if device.type != "cuda":
+            raise unavailable("a run on a CUDA device", f"this one is on device {device.type}")
+        return "graph", []
+    notes = []
     if engine == "native" or (engine == "auto" and native_pays(config, precision, device)):
         obstacle = native_obstacle(config, device)
-        if obstacle is not None and engine == "native":
-            raise ConfigError(f"learning.engine is 'native', {obstacle}; use learning.engine=eager")
-        if obstacle is not None:
-            notes.append(f"updates do not run natively: {obstacle}")
-        elif engine == "auto":
-            notes.append("updates run natively: neuron layers in C++, built once (learning.engine=eager does without)")
-        engine = "auto" if obstacle is not None else "native"
+        if obstacle is None:
+            said = "updates run natively: neuron layers in C++ (learning.engine=eager does without)"
+            return "native", [said] if engine == "auto" else []
+        if engine == "native":
+            raise unavailable("a spiking network on a CPU and a C++ compiler (g++, or what CXX names)", obstacle)
+        notes.append(f"updates do not run natively: {obstacle}")
     if engine == "compiled" or (engine == "auto" and device.type == "cpu" and compiling_pays(config)):
         problem = compile_problem()
-        if problem is not None and engine == "compiled":
-            raise ConfigError(
-                f"learning.engine is 'compiled' and torch.compile fails on this machine ({problem}), expected a C++ "
-                "compiler that it can use (Debian: apt install g++ python3-dev); install one, or use "
-                "learning.engine=eager"
-            )
-        if problem is not None:
-            notes.append(f"updates run uncompiled: torch.compile fails on this machine ({problem})")
-        else:
-            notes.append(
-                "updates are compiled: the first ones take up to a minute (learning.engine=eager does without)"
-            )
-        engine = "eager" if problem is not None else "compiled"
-    engine = "eager" if engine == "auto" else engine
-    return replace(config, learning=replace(learning, precision=precision, engine=engine)), notes
+        if problem is None:
+            said = "updates are compiled: the first ones take some 20 to 35 s (learning.engine=eager does without)"
+            return "compiled", [*notes, said]
+        seen = f"torch.compile fails on this machine ({problem})"
+        if engine == "compiled":
+            raise unavailable("a C++ compiler that it can use (Debian: apt install g++ python3-dev)", seen)
+        notes.append(f"updates run uncompiled: {seen}")
+    return "eager", notes
 
 
 def _require_divisible(config: ExperimentConfig, processes: int) -> None:
@@ -136,16 +142,14 @@ def native_pays(config: ExperimentConfig, precision: str, device: torch.device) 
 
 
 def native_obstacle(config: ExperimentConfig, device: torch.device) -> str | None:
-    """What keeps the native engine from a run: seen and expected, for a message; None if nothing does."""
+    """What keeps the native engine from a run; None if nothing does."""
     if device.type != "cpu":
-        return f"expected another engine on device {device.type}"
+        return f"this run is on device {device.type}"
     setting = native.unsupported(config.network, METHOD_TRAITS[config.network.method].spiking)
     if setting is not None:
-        return f"which has no code for {setting}"
+        return f"it has no code for {setting}"
     problem = native_library.problem()
-    if problem is not None:
-        return f"expected a C++ compiler that builds it (Debian: apt install g++), but: {problem}"
-    return None
+    return None if problem is None else f"it cannot be built here ({problem})"
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -186,7 +190,10 @@ def keep_freed_memory() -> bool:
     except (AttributeError, OSError, TypeError):
         return False
     trim_threshold, mmap_threshold = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
-    return bool(mallopt(mmap_threshold, 2**30)) and bool(mallopt(trim_threshold, 2**31 - 1))
+    # Some versions take no more than 32 MiB.
+    unmapped = mallopt(mmap_threshold, 2**30) or mallopt(mmap_threshold, 2**25)
+    untrimmed = mallopt(trim_threshold, 2**31 - 1)
+    return bool(unmapped and untrimmed)
 
 
 def _processor_of(device: torch.device) -> str:

@@ -134,6 +134,8 @@ def require_memory(estimate: MemoryEstimate, config: ExperimentConfig, available
         if fitting > config.learning.batch_size
         else "lower learning.batch_size and learning.replay_capacity_steps"
     )
+    if config.learning.replay_on_device:
+        remedy += ", or use learning.replay_on_device=false, which lets frames be compressed"
     raise ConfigError(
         f"the run needs {estimate.total_bytes / GIB:.1f} GiB (replay {estimate.replay_bytes / GIB:.1f}, activations "
         f"{estimate.activations_bytes / GIB:.1f}, networks and snapshots "

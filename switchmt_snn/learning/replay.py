@@ -72,7 +72,7 @@ class FrameReplay:
         max_bytes: int | None = None,
         device: torch.device | None = None,
     ) -> None:
-        """Reserve the ring; the system hands out its memory as frames come in.
+        """Reserve the ring; the system hands out an array's memory as frames come in, a tensor's at once.
 
         Args:
             capacity_steps: slots over all lanes. An episode's last frame takes one, too.

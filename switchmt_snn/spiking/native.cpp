@@ -1,5 +1,5 @@
-// Input currents y * scale + shift of each channel, T steps of leaky integrate-and-fire neurons on them, and the
-// gradients of both, each in one pass over memory. The arithmetic is that of neurons.py, step by step.
+// Input currents y * scale + shift of each channel and T steps of leaky integrate-and-fire neurons on them, in one pass
+// over memory, and the gradients of both, in two. The arithmetic is that of neurons.py, step by step.
 //
 // y [T or 1][R][C], spikes [T][R][C]: rows R (batch times places), channels C innermost. A stride of 0 (y_step, g_step)
 // says that every step shares one [R][C]. Sums run over a fixed number of parts, so they do not depend on the threads.

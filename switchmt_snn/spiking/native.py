@@ -1,5 +1,5 @@
-"""Neuron layers in C++ (``native.cpp``), for updates on a CPU: the currents' scale and shift, T steps of neurons, and
-all their gradients take two passes over memory, where single operations take some thirty.
+"""Neuron layers in C++ (``native.cpp``), for updates on a CPU: the currents' scale and shift with T steps of neurons
+are one pass over memory, their gradients two; single operations take some thirty.
 
 Shapes: S steps of the currents (T, or 1 that all steps share), T steps of the spikes, R rows, C channels.
 """

@@ -16,6 +16,8 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
+import torch  # noqa: F401  (brings the OpenMP that native.cpp is linked against)
+
 _SOURCE = Path(__file__).with_name("native.cpp")
 # No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
 _FLAGS = (
@@ -41,13 +43,26 @@ _ARGUMENTS = {
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The compiled and loaded functions.
+    """The compiled and loaded functions; from the cache, if it has them for this source, compiler and processor.
 
     Raises:
-        OSError: no compiler, nowhere to write, or a file that cannot be loaded.
+        OSError: there is no compiler.
         subprocess.SubprocessError: the compiler failed.
     """
-    loaded = ctypes.CDLL(str(compiled()))
+    compiler = _compiler()
+    kept = _cache() / f"native-{_key(compiler)}.so"
+    try:
+        loaded = ctypes.CDLL(str(kept))
+    except OSError:  # not there, or damaged
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+            built = _build(compiler, Path(scratch))
+            loaded = ctypes.CDLL(str(built))
+            with suppress(OSError):  # a cache that cannot be written to
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                handle, beside = tempfile.mkstemp(dir=kept.parent)
+                os.close(handle)
+                shutil.copyfile(built, beside)
+                os.replace(beside, kept)
     for name, kinds in _ARGUMENTS.items():
         function = getattr(loaded, name)
         function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
@@ -58,43 +73,41 @@ def problem() -> str | None:
     """One line on why ``native.cpp`` cannot be compiled and loaded here; None if it can."""
     try:
         library()
+    except subprocess.CalledProcessError as error:
+        return (str(error.stderr).strip() or f"{error.cmd[0]} ends with {error.returncode}").splitlines()[0][:120]
     except (OSError, subprocess.SubprocessError) as error:
-        output = getattr(error, "stderr", None) or str(error)
-        return str(output).strip().splitlines()[0][:120]
+        return str(error).splitlines()[0][:120]
     return None
 
 
-def compiled() -> Path:
-    """The library's file, made if the cache has none for this source, compiler and processor.
+def _compiler() -> list[str]:
+    wish = os.environ.get("CXX", "").strip() or "g++"
+    try:
+        command = shlex.split(wish)
+    except ValueError as error:
+        raise OSError(f"no C++ compiler {wish!r}: {error}") from error
+    if shutil.which(command[0]) is None:
+        raise OSError(f"no C++ compiler {command[0]!r}")
+    return command
 
-    Raises:
-        OSError: no compiler, or nowhere to write.
-        subprocess.SubprocessError: the compiler failed.
-    """
-    compiler = shlex.split(os.environ.get("CXX") or "g++")
-    if shutil.which(compiler[0]) is None:
-        raise OSError(f"no C++ compiler {compiler[0]!r}")
+
+def _key(compiler: list[str]) -> str:
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
-    what = [_SOURCE.read_text(), version, " ".join(_FLAGS), platform.machine(), _instructions()]
-    name = f"native-{hashlib.sha256(chr(0).join(what).encode()).hexdigest()[:16]}.so"
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "switchmt_snn"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / name).exists():
-            return folder / name
-        scratch = Path(tempfile.mkdtemp(dir=folder))
-    except OSError:  # no home to write to
-        folder = scratch = Path(tempfile.mkdtemp())
-    try:
-        unlinked, linked = scratch / "native.o", scratch / name
-        for command in ([*_FLAGS, "-c", str(_SOURCE), "-o", str(unlinked)], ["-shared", str(unlinked), "-o", linked]):
-            # Linked without OpenMP: its symbols are found in the one that PyTorch has loaded.
-            subprocess.run([*compiler, *command], capture_output=True, text=True, check=True)
-        os.replace(linked, folder / name)
-    finally:
-        if scratch != folder:
-            shutil.rmtree(scratch, ignore_errors=True)
-    return folder / name
+    what = [_SOURCE.read_text(), *compiler, version, *_FLAGS, platform.machine(), _instructions()]
+    return hashlib.sha256("\0".join(what).encode()).hexdigest()[:16]
+
+
+def _cache() -> Path:
+    wish = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (wish if wish.is_absolute() else Path("~/.cache").expanduser()) / "switchmt_snn"
+
+
+def _build(compiler: list[str], folder: Path) -> Path:
+    unlinked, linked = folder / "native.o", folder / "native.so"
+    # Linked without OpenMP: its symbols are found in the one that PyTorch has loaded.
+    for options in ([*_FLAGS, "-c", str(_SOURCE), "-o", str(unlinked)], ["-shared", str(unlinked), "-o", str(linked)]):
+        subprocess.run([*compiler, *options], capture_output=True, text=True, check=True)
+    return linked
 
 
 def _instructions() -> str:
