@@ -3,7 +3,7 @@
 ``python -m benchmarks.update_step [--batch 32] [--timesteps 4] [--repeats 15] [--device cpu] [--only TEXT ...]
 [--hand-memory-back] [--json]``. All variants have the same layers and the same random batch. SpikingJelly takes part
 where it is installed (extra ``simulators``); on a GPU it chooses its kernels itself. There, batches lie on the device,
-ours runs as a CUDA graph, too, every variant's peak of memory is given, and one that fails is told with its reason and
+ours runs as a CUDA graph, too, and every variant's peak of memory is given. One that fails is told with its reason and
 left out.
 
 The physical limit of a variant is the time of its products alone (forward for Q*, Q and training, backward for weights
@@ -136,16 +136,20 @@ def measure(batch_size: int, timesteps: int, repeats: int, device: str, only: li
     """The plain loop and all variants (or those whose name has one of the texts in it), interleaved."""
     steps, limits = variants(batch_size, timesteps, device)
     if only:
-        steps = {name: step for name, step in steps.items() if name == PLAIN or any(text in name for text in only)}
+        chosen = [name for name in steps if any(text in name for text in only)]
+        if not chosen:
+            raise SystemExit(f"--only is {' '.join(only)}, expected a text in one of: {'; '.join(steps)}")
+        steps = {name: steps[name] for name in (PLAIN, *chosen) if name in steps}
     failed, peaks_mib = {}, {}
-    if device == "cuda":
-        for name, step in list(steps.items()):
-            steps[name] = functools.partial(_synchronized, step)
-            try:
+    for name, step in list(steps.items()):
+        steps[name] = functools.partial(_synchronized, step) if device == "cuda" else step
+        try:
+            steps[name]()
+            if device == "cuda":
                 peaks_mib[name] = _peak_mib(steps[name])
-            except Exception as error:
-                failed[name] = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-                del steps[name]
+        except Exception as error:
+            failed[name] = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            del steps[name]
     times = interleaved_ms(steps, repeats, warmup=4)
     slowest = statistics.median(times[PLAIN])
     rows = {
@@ -179,14 +183,17 @@ def _synchronized(step: Callable[[], None]) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--batch", type=int, default=32)
-    parser.add_argument("--timesteps", type=int, default=4)
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--batch", type=int, default=32, help="transitions of an update")
+    parser.add_argument("--timesteps", type=int, default=4, help="simulation steps T")
+    parser.add_argument("--repeats", type=int, default=15, help="rounds in which every variant takes its turn")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where all variants run")
     parser.add_argument("--only", nargs="*", default=[], metavar="TEXT", help="variants with such a text in their name")
     parser.add_argument("--hand-memory-back", action="store_true", help="leave the C library's memory settings alone")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    for name, least in (("batch", 2), ("timesteps", 1), ("repeats", 1)):
+        if getattr(options, name) < least:
+            parser.error(f"--{name} is {getattr(options, name)}, expected at least {least}")
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device is cuda, expected a machine with a CUDA device and a torch built for it; use cpu")
     if not options.hand_memory_back:
