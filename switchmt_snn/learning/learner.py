@@ -182,11 +182,17 @@ class Learner(Stateful):
                 self.copy_target()
             else:
                 super().load_state_dict(self._group.share())
+        self._release()
 
     def close(self) -> None:
-        """Let the other processes go."""
+        """Let the other processes go; no update can follow."""
         if self._group is not None:
             self._group.announce(STOP)
+            self._release()
+
+    def _release(self) -> None:
+        """Let DistributedDataParallel go while its process group is there: later, PyTorch may abort the process."""
+        del self._evaluate
 
     def take_means(self) -> dict[str, float]:
         """Mean loss and mean Q(s, a) of the updates since the last call; empty if there were none."""

@@ -8,6 +8,7 @@ apart: every process draws its own spikes).
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from dataclasses import fields
@@ -102,7 +103,8 @@ class ProcessGroup:
         return box[0]
 
     def leave(self) -> None:
-        """Leave the group."""
+        """Leave the group; what refers to it must be let go before."""
+        gc.collect()
         dist.destroy_process_group()
 
 
