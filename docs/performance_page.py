@@ -284,7 +284,8 @@ def fast_part(environments: dict[str, Any], replay: dict[str, Any]) -> list[str]
         "|---|---|---|---|",
         f"| {copies} environment steps | the update | {copies / slowest * 1e3:.1f} on {cores} cores; "
         f"{copies / slowest * 1e3 * cores / 16:.1f} on 16 if only cores count | slowest game above, 16 copies |",
-        f"| sample {batch} from plain frames | the environments | {sample:.1f} | replay table |",
+        f"| sample {batch} from plain frames | the environments | {sample:.1f} on the host; **not measured** on a GPU, "
+        "where the preset keeps them | replay table |",
         "| update (`--learning.engine graph`) | the environments | **not measured** on a GPU | `python -m "
         "benchmarks.update_step --device cuda "
         f"--batch {batch}` |",

@@ -134,6 +134,9 @@ def test_what_cplusplus_would_read_wrongly_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match="expected"):
             neurons.gated(y, ones, dtype)
+    for gain_C in (ones.double(), torch.ones(1)):
+        with pytest.raises(ValueError, match="expected float32 for 8 channels"):
+            neurons.gated(torch.zeros(4, 5, 8), gain_C, torch.float32)
 
 
 @builds
@@ -257,6 +260,8 @@ def test_no_compiler_and_a_failing_one_are_one_line(tmp_path: Path, monkeypatch:
             machine.settle(asked, None, CPU)
         with pytest.raises(ConfigError, match=r"this run was begun, .*\(unhappy\); start another run \(--run OTHER"):
             machine.settle(small_config(), asked, CPU)
+        with pytest.raises(ConfigError, match=r"is 'native', expected .*\(unhappy\); use learning.engine=eager"):
+            machine.settle(asked, small_config(learning={"engine": "eager"}), CPU)  # not what it was begun with
         for value in ('"g++', "no-such-compiler -g"):
             monkeypatch.setenv("CXX", value)
             assert str(native_library.problem()).startswith("no C++ compiler")

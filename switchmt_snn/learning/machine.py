@@ -63,7 +63,8 @@ def settle(
     if processes > 1:
         _require_divisible(config, processes)
         engine = "eager"
-    engine, engine_notes = _settle_engine(engine, config, precision, device, begun=stored is not None)
+    begun = stored is not None and stored.learning.engine == engine
+    engine, engine_notes = _settle_engine(engine, config, precision, device, begun)
     return replace(config, learning=replace(learning, precision=precision, engine=engine)), notes + engine_notes
 
 
@@ -136,7 +137,7 @@ def compiling_pays(config: ExperimentConfig) -> bool:
 def native_pays(config: ExperimentConfig, precision: str, device: torch.device) -> bool:
     """Whether ``auto`` takes the native engine: with bfloat16 products, neurons are what takes time.
 
-    In float32 products take most of it, and small networks gain more from compiled code (docs/performance.md).
+    In float32 products take most of it (docs/performance.md), and MinAtar's small network is faster compiled.
     """
     return device.type == "cpu" and precision == "bfloat16" and config.network.trunk == "nature"
 

@@ -94,9 +94,15 @@ class Neurons:
         """Spikes ``[T, R, C]``, without gradient.
 
         Raises:
-            ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``.
+            ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``;
+                scale or shift are not contiguous float32.
         """
         steps, rows, channels = y_SRC.shape
+        for numbers_C in (scale_C, shift_C):
+            if numbers_C.dtype != torch.float32 or numbers_C.shape != (channels,) or not numbers_C.is_contiguous():
+                raise ValueError(
+                    f"{numbers_C.dtype} {tuple(numbers_C.shape)}, expected float32 for {channels} channels"
+                )
         if not y_SRC.is_contiguous() or steps not in (1, self.timesteps) or dtype not in (torch.float32, y_SRC.dtype):
             raise ValueError(
                 f"{y_SRC.dtype} {tuple(y_SRC.shape)} with strides {y_SRC.stride()} for spikes in {dtype}, expected "
@@ -145,6 +151,7 @@ class Neurons:
 
 def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and biased variance of every channel ``[C]`` over steps and rows."""
+    y_SRC = y_SRC.contiguous()
     steps, rows, channels = y_SRC.shape
     mean_C, variance_C = torch.empty(channels), torch.empty(channels)
     library().snn_moments(
