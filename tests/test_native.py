@@ -61,7 +61,7 @@ def test_spikes_are_bitwise_those_of_the_eager_neurons(form, timesteps, shared, 
     weights, results = torch.randn(timesteps, rows, channels), []
     for run in (Neurons(config).gated, None):
         y_SRC, gain_C = y.clone().requires_grad_(), torch.linspace(0.3, 1.2, channels).requires_grad_()
-        spikes = plain_gated(config, y_SRC, gain_C) if run is None else run(y_SRC, gain_C, torch.float32)
+        spikes = plain_gated(config, y_SRC, gain_C) if run is None else run(y_SRC, gain_C, torch.float32).numbers
         (spikes * weights).sum().backward()
         results.append((spikes, y_SRC.grad, gain_C.grad))
     (ours, *our_grads), (theirs, *their_grads) = results
@@ -88,7 +88,8 @@ def test_normalized_spikes_equal_batch_norm_and_neurons(dtype: torch.dtype, step
         if is_native:
             mean_C, var_C = batch_moments(y_SRC.detach())
             inverse_std_C = (var_C + 1e-5).rsqrt()
-            spikes = Neurons(config).normalized(y_SRC, weight_C, bias_C, mean_C, inverse_std_C, of_batch=True)
+            of = (y_SRC, weight_C, bias_C, mean_C, inverse_std_C)
+            spikes = Neurons(config).normalized(*of, of_batch=True, dtype=dtype).numbers
         else:
             flat = y_SRC.flatten(0, 1).to(torch.float64)
             current = F.batch_norm(flat, None, None, weight_C.double(), bias_C.double(), True, 0.1, 1e-5)
@@ -148,7 +149,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
         for number in (1, 2, 3):
             torch.set_num_threads(number)
             y_SRC, gain_C = y.clone().requires_grad_(), torch.ones(48, requires_grad=True)
-            (Neurons(config).gated(y_SRC, gain_C, torch.float32) * g).sum().backward()
+            (Neurons(config).gated(y_SRC, gain_C, torch.float32).numbers * g).sum().backward()
             results.append((y_SRC.grad, gain_C.grad, *batch_moments(y)))
     finally:
         torch.set_num_threads(threads)

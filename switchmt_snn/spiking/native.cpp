@@ -6,36 +6,19 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <cstring>
 #include <type_traits>
 #include <vector>
+
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
+
+#include "native_numbers.h"
 
 namespace {
 
 constexpr long PARTS = 64;
 constexpr long WIDTH = 32;  // channels that are worked on together
-
-struct BFloat16 {
-    uint16_t bits;
-};
-
-inline float number(float x) { return x; }
-
-inline float number(BFloat16 x) {
-    uint32_t bits = uint32_t(x.bits) << 16;
-    float value;
-    std::memcpy(&value, &bits, 4);
-    return value;
-}
-
-inline void put(float* place, float x) { *place = x; }
-
-inline void put(BFloat16* place, float x) {  // to the nearest, ties to even; not a number stays so
-    uint32_t bits;
-    std::memcpy(&bits, &x, 4);
-    uint32_t rounded = (bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16;
-    place->bits = uint16_t(x != x ? 0x7fc0u : rounded);
-}
 
 struct Neuron {
     float beta, threshold, slope;  // the last one of the surrogate gradient
@@ -71,9 +54,24 @@ inline void blocks(long channels, F run) {
     if (c < channels) run(c, channels - c);
 }
 
+// A bit for each of `width` membranes that is above the threshold.
+inline uint32_t fired_bits(const float* u, float threshold, long width) {
+#ifdef __AVX512F__
+    if (width == WIDTH) {
+        __m512 limit = _mm512_set1_ps(threshold);
+        return uint32_t(_mm512_cmp_ps_mask(_mm512_loadu_ps(u), limit, _CMP_GT_OQ)) |
+               uint32_t(_mm512_cmp_ps_mask(_mm512_loadu_ps(u + 16), limit, _CMP_GT_OQ)) << 16;
+    }
+#endif
+    uint32_t bits = 0;
+    for (long i = 0; i < width; i++) bits |= uint32_t(u[i] > threshold) << i;
+    return bits;
+}
+
 template <bool ZERO, class Y, class S>
 void fire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, S* spikes, long steps,
           long rows, long channels, int threads) {
+    long words = (channels + WIDTH - 1) / WIDTH;
 #pragma omp parallel num_threads(threads)
     {
         std::vector<float> u(steps * WIDTH);
@@ -83,8 +81,11 @@ void fire(const Neuron& n, const Y* y, long y_step, const float* scale, const fl
                 long at = r * channels + c;
                 membranes<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width, u.data());
                 for (long t = 0; t < steps; t++)
-                    for (long i = 0; i < width; i++)
-                        put(spikes + t * rows * channels + at + i, u[t * WIDTH + i] > n.threshold ? 1.0f : 0.0f);
+                    if constexpr (std::is_same_v<S, uint32_t>)
+                        spikes[(t * rows + r) * words + c / WIDTH] = fired_bits(&u[t * WIDTH], n.threshold, width);
+                    else
+                        for (long i = 0; i < width; i++)
+                            put(spikes + t * rows * channels + at + i, u[t * WIDTH + i] > n.threshold ? 1.0f : 0.0f);
             });
     }
 }
@@ -214,6 +215,17 @@ void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const floa
         with_types(y_low, spikes_low, [&](auto y_, auto s_) {
             fire<zero.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, (decltype(s_)*)spikes, steps, rows,
                              channels, threads);
+        });
+    });
+}
+
+// The same spikes as bits: channel c is bit c % 32 of words [T][R][ceil(C / 32)].
+void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const float* scale, const float* shift,
+                   void* words, long steps, long rows, long channels, int threads) {
+    with_flag(n->zero, [&](auto zero) {
+        with_type(y_low, [&](auto y_) {
+            fire<zero.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, (uint32_t*)words, steps, rows, channels,
+                             threads);
         });
     });
 }

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.spiking.native_library import library
+from switchmt_snn.spiking.native_library import library, typed
 from switchmt_snn.spiking.neurons import DEFAULT_SLOPE
 
 _SURROGATES = ("atan", "fast_sigmoid")
@@ -43,6 +43,20 @@ def unsupported(config: NetworkConfig, spiking: bool) -> str | None:
     return "network.neuron_engine=snntorch" if config.neuron_engine == "snntorch" else None
 
 
+class Spikes(NamedTuple):
+    """What a layer sends to the next one."""
+
+    numbers: Tensor
+    """``[T, ..., C]`` in memory. If there are bits, only the way that gradients take: it has no memory of its own."""
+    bits: Tensor | None = None
+    """int32 ``[T, ..., words]``: channel c is bit c % 32 of word c // 32."""
+
+    def with_rows(self, shape: tuple[int, ...]) -> Spikes:
+        """``[T, *shape, C]`` instead of ``[T, R, C]``."""
+        bits = None if self.bits is None else self.bits.unflatten(1, shape)
+        return Spikes(self.numbers.unflatten(1, shape), bits)
+
+
 class Currents(NamedTuple):
     """How currents come from synaptic products: ``y * scale + shift``, and what the gradient must know of it."""
 
@@ -70,28 +84,45 @@ class Neurons:
         self._neuron = _Neuron(beta, config.threshold, slope, config.reset == "zero", fast_sigmoid)
         self.timesteps = config.timesteps
 
-    def gated(self, y_SRC: Tensor, gain_C: Tensor, dtype: torch.dtype) -> Tensor:
-        """Spikes ``[T, R, C]`` for currents ``y * gain``."""
-        gain_C, zero_C = gain_C.contiguous(), torch.zeros(y_SRC.shape[-1])
-        if not torch.is_grad_enabled():
-            return self.fire(y_SRC, gain_C, zero_C, dtype)
-        return _spikes(self, y_SRC, gain_C, zero_C, None, None, dtype)
+    def gated(self, y_SRC: Tensor, gain_C: Tensor, dtype: torch.dtype) -> Spikes:
+        """Spikes for currents ``y * gain``; ``dtype`` as for :meth:`fire`."""
+        return self._spikes(y_SRC, gain_C.contiguous(), torch.zeros(y_SRC.shape[-1]), None, None, dtype)
 
     def normalized(
-        self, y_SRC: Tensor, weight_C: Tensor, bias_C: Tensor, mean_C: Tensor, inverse_std_C: Tensor, of_batch: bool
-    ) -> Tensor:
-        """Spikes ``[T, R, C]`` for currents ``(y - mean) * inverse_std * weight + bias``.
+        self,
+        y_SRC: Tensor,
+        weight_C: Tensor,
+        bias_C: Tensor,
+        mean_C: Tensor,
+        inverse_std_C: Tensor,
+        of_batch: bool,
+        dtype: torch.dtype,
+    ) -> Spikes:
+        """Spikes for currents ``(y - mean) * inverse_std * weight + bias``; ``dtype`` as for :meth:`fire`.
 
         ``of_batch``: mean and deviation are those of ``y`` itself, and the gradient goes through them; else there is no
         gradient.
         """
-        if of_batch and torch.is_grad_enabled():
-            return _spikes(self, y_SRC, weight_C, bias_C, mean_C, inverse_std_C, y_SRC.dtype)
+        if of_batch:
+            return self._spikes(y_SRC, weight_C, bias_C, mean_C, inverse_std_C, dtype)
         scale_C = weight_C.detach() * inverse_std_C
-        return self.fire(y_SRC, scale_C, bias_C.detach() - mean_C * scale_C, y_SRC.dtype)
+        return self._spikes(y_SRC.detach(), scale_C, bias_C.detach() - mean_C * scale_C, None, None, dtype)
+
+    def _spikes(
+        self,
+        y_SRC: Tensor,
+        a_C: Tensor,
+        b_C: Tensor,
+        mean_C: Tensor | None,
+        inverse_std_C: Tensor | None,
+        dtype: torch.dtype,
+    ) -> Spikes:
+        what = (y_SRC, a_C, b_C, mean_C, inverse_std_C, self, dtype)
+        return Spikes(*_Spikes.apply(*what))  # type: ignore[no-untyped-call]
 
     def fire(self, y_SRC: Tensor, scale_C: Tensor, shift_C: Tensor, dtype: torch.dtype) -> Tensor:
-        """Spikes ``[T, R, C]``, without gradient.
+        """Spikes ``[T, R, C]`` of currents ``y * scale + shift``, without gradient; as bits if ``dtype`` is int32:
+        ``[T, R, words]``, channel c being bit c % 32 of word c // 32.
 
         Raises:
             ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``;
@@ -103,24 +134,19 @@ class Neurons:
                 raise ValueError(
                     f"{numbers_C.dtype} {tuple(numbers_C.shape)}, expected float32 for {channels} channels"
                 )
-        if not y_SRC.is_contiguous() or steps not in (1, self.timesteps) or dtype not in (torch.float32, y_SRC.dtype):
+        fitting = dtype in (torch.float32, torch.int32, y_SRC.dtype)
+        if not y_SRC.is_contiguous() or steps not in (1, self.timesteps) or not fitting:
             raise ValueError(
                 f"{y_SRC.dtype} {tuple(y_SRC.shape)} with strides {y_SRC.stride()} for spikes in {dtype}, expected "
                 f"contiguous currents of 1 or {self.timesteps} steps, and spikes in float32 or the currents' dtype"
             )
-        spikes = torch.empty(self.timesteps, rows, channels, dtype=dtype)
-        library().snn_fire(
-            ctypes.addressof(self._neuron),
-            *_typed(y_SRC),
-            _step(y_SRC),
-            scale_C.data_ptr(),
-            shift_C.data_ptr(),
-            *_typed(spikes),
-            self.timesteps,
-            rows,
-            channels,
-            torch.get_num_threads(),
-        )
+        as_bits = dtype == torch.int32
+        spikes = torch.empty(self.timesteps, rows, -(-channels // 32) if as_bits else channels, dtype=dtype)
+        currents = (*typed(y_SRC), _step(y_SRC), scale_C.data_ptr(), shift_C.data_ptr())
+        where = (spikes.data_ptr(),) if as_bits else typed(spikes)
+        fire = library().snn_fire_bits if as_bits else library().snn_fire
+        sizes = (self.timesteps, rows, channels, torch.get_num_threads())
+        fire(ctypes.addressof(self._neuron), *currents, *where, *sizes)
         return spikes
 
     def unfire(self, y_SRC: Tensor, currents: Currents, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,12 +158,12 @@ class Neurons:
             grad_TRC = grad_TRC.contiguous()
         library().snn_unfire(
             ctypes.addressof(self._neuron),
-            *_typed(y_SRC),
+            *typed(y_SRC),
             _step(y_SRC),
             currents.scale_C.data_ptr(),
             currents.shift_C.data_ptr(),
             currents.center_C.data_ptr(),
-            *_typed(grad_TRC),
+            *typed(grad_TRC),
             grad_TRC.stride(0),
             grad_SRC.data_ptr(),
             sums_2C.data_ptr(),
@@ -155,7 +181,7 @@ def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
     steps, rows, channels = y_SRC.shape
     mean_C, variance_C = torch.empty(channels), torch.empty(channels)
     library().snn_moments(
-        *_typed(y_SRC), mean_C.data_ptr(), variance_C.data_ptr(), steps * rows, channels, torch.get_num_threads()
+        *typed(y_SRC), mean_C.data_ptr(), variance_C.data_ptr(), steps * rows, channels, torch.get_num_threads()
     )
     return mean_C, variance_C
 
@@ -166,7 +192,7 @@ def scaled_images(x_BCHW: Tensor, scale: float, dtype: torch.dtype) -> Tensor:
     x_BCHW = x_BCHW.contiguous()
     out_BHWC = torch.empty(batch, height, width, channels, dtype=dtype)
     library().snn_images(
-        x_BCHW.data_ptr(), scale, *_typed(out_BHWC), batch, channels, height * width, torch.get_num_threads()
+        x_BCHW.data_ptr(), scale, *typed(out_BHWC), batch, channels, height * width, torch.get_num_threads()
     )
     return out_BHWC.permute(0, 3, 1, 2)
 
@@ -184,7 +210,7 @@ class _Spikes(torch.autograd.Function):
         inverse_std_C: Tensor | None,
         neurons: Neurons,
         dtype: torch.dtype,
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor | None]:
         if mean_C is None or inverse_std_C is None:
             currents = Currents(a_C, b_C, torch.zeros_like(b_C), None)
         else:
@@ -192,7 +218,10 @@ class _Spikes(torch.autograd.Function):
             currents = Currents(scale_C, b_C - mean_C * scale_C, mean_C, inverse_std_C)
         ctx.save_for_backward(y_SRC, *currents)
         ctx.neurons = neurons
-        return neurons.fire(y_SRC, currents.scale_C, currents.shift_C, dtype)
+        spikes = neurons.fire(y_SRC, currents.scale_C, currents.shift_C, dtype)
+        if dtype != torch.int32:
+            return spikes, None
+        return torch.zeros((), dtype=y_SRC.dtype).expand(neurons.timesteps, *y_SRC.shape[1:]), spikes
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -210,7 +239,7 @@ class _Spikes(torch.autograd.Function):
         grad_y_SRC = torch.empty_like(y_SRC)
         library().snn_combine(
             grad_SRC.data_ptr(),
-            *_typed(y_SRC),
+            *typed(y_SRC),
             currents.scale_C.data_ptr(),
             currents.center_C.data_ptr(),
             slope_C.data_ptr(),
@@ -221,27 +250,6 @@ class _Spikes(torch.autograd.Function):
             torch.get_num_threads(),
         )
         return grad_y_SRC, grad_a_C, sum_C, None, None, None, None
-
-
-def _spikes(
-    neurons: Neurons,
-    y_SRC: Tensor,
-    a_C: Tensor,
-    b_C: Tensor,
-    mean_C: Tensor | None,
-    inverse_std_C: Tensor | None,
-    dtype: torch.dtype,
-) -> Tensor:
-    what = (y_SRC, a_C, b_C, mean_C, inverse_std_C, neurons, dtype)
-    spikes: Tensor = _Spikes.apply(*what)  # type: ignore[no-untyped-call]
-    return spikes
-
-
-def _typed(tensor: Tensor) -> tuple[int, int]:
-    """Where numbers lie, and whether they are bfloat16; ValueError for what C++ would read wrongly."""
-    if not tensor.is_cpu or tensor.dtype not in (torch.float32, torch.bfloat16):
-        raise ValueError(f"{tensor.dtype} on {tensor.device}, expected float32 or bfloat16 on the CPU")
-    return tensor.data_ptr(), int(tensor.dtype == torch.bfloat16)
 
 
 def _step(y_SRC: Tensor) -> int:

@@ -1,5 +1,5 @@
-"""``native.cpp`` as a library: compiled by the machine's C++ compiler at its first use, for the processor at hand, kept
-in the user's cache, and loaded. Its parallel loops run in PyTorch's own pool of threads.
+"""``native.cpp`` and ``native_products.cpp`` as a library: compiled by the machine's C++ compiler at its first use, for
+the processor at hand, kept in the user's cache, and loaded. Its parallel loops run in PyTorch's own pool of threads.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-import torch  # noqa: F401  (brings the OpenMP that native.cpp is linked against)
+import torch  # also brings the OpenMP that the sources are linked against
+from torch import Tensor
 
-_SOURCE = Path(__file__).with_name("native.cpp")
+_HEADER = Path(__file__).with_name("native_numbers.h")
+_SOURCES = tuple(Path(__file__).with_name(name) for name in ("native.cpp", "native_products.cpp"))
 # No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
 _FLAGS = (
     "-std=c++17",
@@ -37,8 +39,17 @@ _ARGUMENTS = {
     "snn_combine": "ppippppplli",
     "snn_moments": "pipplli",
     "snn_images": "pfpillli",
+    "snn_fire_bits": "ppilpppllli",
 }
-"""Pointers, ints, longs and floats that the functions of ``native.cpp`` take."""
+"""Pointers, ints, longs and floats that the functions take."""
+_PRODUCTS = {
+    "snn_windows": "pplllllli",
+    "snn_flat": "ppllli",
+    "snn_transpose": "pplli",
+    "snn_multiply": "pipppllli",
+    "snn_multiply_transposed": "pippllli",
+}
+"""Those that are there if ``snn_has_products`` says so."""
 
 
 @functools.cache
@@ -63,7 +74,7 @@ def library() -> ctypes.CDLL:
                 os.close(handle)
                 shutil.copyfile(built, beside)
                 os.replace(beside, kept)
-    for name, kinds in _ARGUMENTS.items():
+    for name, kinds in {**_ARGUMENTS, **(_PRODUCTS if loaded.snn_has_products() else {})}.items():
         function = getattr(loaded, name)
         function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
     return loaded
@@ -93,7 +104,14 @@ def _compiler() -> list[str]:
 
 def _key(compiler: list[str]) -> str:
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
-    what = [_SOURCE.read_text(), *compiler, version, *_FLAGS, platform.machine(), _instructions()]
+    what = [
+        *(source.read_text() for source in (_HEADER, *_SOURCES)),
+        *compiler,
+        version,
+        *_FLAGS,
+        platform.machine(),
+        _instructions(),
+    ]
     return hashlib.sha256("\0".join(what).encode()).hexdigest()[:16]
 
 
@@ -103,9 +121,10 @@ def _cache() -> Path:
 
 
 def _build(compiler: list[str], folder: Path) -> Path:
-    unlinked, linked = folder / "native.o", folder / "native.so"
+    linked, objects = folder / "native.so", [folder / f"{source.stem}.o" for source in _SOURCES]
+    steps = [[*_FLAGS, "-c", str(source), "-o", str(made)] for source, made in zip(_SOURCES, objects, strict=True)]
     # Linked without OpenMP: its symbols are found in the one that PyTorch has loaded.
-    for options in ([*_FLAGS, "-c", str(_SOURCE), "-o", str(unlinked)], ["-shared", str(unlinked), "-o", str(linked)]):
+    for options in (*steps, ["-shared", *map(str, objects), "-o", str(linked)]):
         subprocess.run([*compiler, *options], capture_output=True, text=True, check=True)
     return linked
 
@@ -117,3 +136,14 @@ def _instructions() -> str:
             if line.startswith(("flags", "Features")):
                 return line
     return platform.processor()
+
+
+def typed(tensor: Tensor) -> tuple[int, int]:
+    """Where numbers lie, and whether they are bfloat16.
+
+    Raises:
+        ValueError: C++ would read them wrongly.
+    """
+    if not tensor.is_cpu or tensor.dtype not in (torch.float32, torch.bfloat16):
+        raise ValueError(f"{tensor.dtype} on {tensor.device}, expected float32 or bfloat16 on the CPU")
+    return tensor.data_ptr(), int(tensor.dtype == torch.bfloat16)

@@ -7,22 +7,14 @@ Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from switchmt_snn.spiking.native import Neurons, batch_moments, scaled_images
+from switchmt_snn.spiking.native import Neurons, Spikes, batch_moments, scaled_images
+from switchmt_snn.spiking.native_products import Features, Synapses, convolved, has_spike_products
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
-
-
-class Synapses(NamedTuple):
-    """Weights and bias of a layer in the products' dtype; of a convolution, with channels innermost."""
-
-    weight: Tensor
-    bias: Tensor
-    stride: int
 
 
 class NativeNetwork:
@@ -36,17 +28,19 @@ class NativeNetwork:
         """Raises ValueError for a network that the native engine has no code for."""
         self._network = network
         self._dtype = torch.float32 if precision is None else precision
+        self._form = torch.int32 if has_spike_products() else self._dtype
+        """What spikes are kept as: bits, or numbers of the products' dtype."""
         self._neurons = Neurons(network.config)
         self._frozen: tuple[int, dict[str, Synapses]] | None = None
 
     def inputs(self, observation: Tensor, generator: torch.Generator) -> Tensor:
-        """Encoded inputs ``[S, B, ...]`` in the products' dtype and layout for raw observations ``[B, ...]``."""
+        """Encoded inputs ``[S, B, H, W, C]`` or ``[S, B, C]`` in the products' dtype for raw observations."""
         network = self._network
         if network.config.encoding == "direct" and observation.dtype == torch.uint8 and observation.dim() == 4:
-            return scaled_images(observation, network.observation.scale, self._dtype).unsqueeze(0)
-        x = network.encode(observation, generator)
-        flat = _channels_last(x.flatten(0, 1).to(self._dtype))
-        return cast(Tensor, flat.unflatten(0, x.shape[:2]))
+            images = scaled_images(observation, network.observation.scale, self._dtype)
+            return images.permute(0, 2, 3, 1).unsqueeze(0)
+        x = network.encode(observation, generator).to(self._dtype)
+        return x.movedim(2, -1).contiguous()
 
     def synapses(self) -> dict[str, Synapses]:
         """All layers' synapses as they are now, by layer name; those of a network without gradients are kept."""
@@ -60,47 +54,46 @@ class NativeNetwork:
         return synapses
 
     def _rounded(self, owner: TrunkLayer | Stream) -> Synapses:
-        layer: nn.Module = owner.synapses[-1] if isinstance(owner.synapses, nn.Sequential) else owner.synapses
-        weight, bias = (cast(Tensor, parameter).to(self._dtype) for parameter in (layer.weight, layer.bias))
-        return Synapses(_channels_last(weight), bias, layer.stride[0] if isinstance(layer, nn.Conv2d) else 0)
+        layer = owner.synapses[-1] if isinstance(owner.synapses, nn.Sequential) else owner.synapses
+        return Synapses.of(cast(nn.Linear | nn.Conv2d, layer), self._dtype)
 
     def decide(self, x: Tensor, context: Context, synapses: dict[str, Synapses], training: bool) -> Tensor:
         """Q-values ``[B, A]`` of :meth:`inputs` in a task's context; normalisation as ``training`` says."""
-        network, batch = self._network, x.shape[1]
+        network, spikes = self._network, Spikes(x)
         for name, layer in network.trunk.items():
-            x = self._trunk_layer(cast(TrunkLayer, layer), x, context[name], synapses[name], training)
-        features = x.flatten(2).flatten(0, 1)
+            spikes = self._trunk_layer(cast(TrunkLayer, layer), spikes, context[name], synapses[name], training)
+        features = Features(spikes)
         outputs = {}
         for name, stream in network.streams.items():
-            y_TBN = F.linear(features, *synapses[name][:2]).view(-1, batch, len(synapses[name].bias))
-            spikes_TBN = self._neurons.gated(y_TBN, _gain(cast(Stream, stream), context[name], y_TBN), torch.float32)
+            y_TBN = features.connected(synapses[name])
+            gain_N = _gain(cast(Stream, stream), context[name], y_TBN)
+            spikes_TBN = self._neurons.gated(y_TBN, gain_N, torch.float32).numbers
             outputs[name] = network.read_out(cast(Stream, stream), spikes_TBN)
         return network.combine(outputs)
 
     def _trunk_layer(
-        self, layer: TrunkLayer, x: Tensor, context: tuple[Tensor, ...], synapses: Synapses, training: bool
-    ) -> Tensor:
-        """Spikes ``[T, B, ...]`` in the products' dtype."""
-        flat = x.flatten(0, 1)
+        self, layer: TrunkLayer, x: Spikes, context: tuple[Tensor, ...], synapses: Synapses, training: bool
+    ) -> Spikes:
+        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``, as the next layer reads them."""
         if layer.normalization is None:
-            y_SBN = F.linear(flat.flatten(1), *synapses[:2]).unflatten(0, x.shape[:2])
-            return self._neurons.gated(y_SBN, torch.ones(y_SBN.shape[-1]), self._dtype)
-        y: Tensor = _Convolution.apply(flat, *synapses)  # type: ignore[no-untyped-call]
-        _, channels, height, width = y.shape
-        y_SRC = y.permute(0, 2, 3, 1).reshape(x.shape[0], -1, channels)
+            y_SBN = Features(x).connected(synapses)
+            return self._neurons.gated(y_SBN, torch.ones(y_SBN.shape[-1]), self._form)
+        y = convolved(x, synapses)
+        y_SRC = y.flatten(1, -2)
         normalization, (mean_C, var_C) = layer.normalization, context
         if training:
             mean_C, var_C = batch_moments(y_SRC.detach())
             normalization.move(context, mean_C, var_C, y_SRC.shape[0] * y_SRC.shape[1])
-        spikes_TRC = self._neurons.normalized(
+        spikes = self._neurons.normalized(
             y_SRC,
             normalization.weight,
             normalization.bias,
             mean_C,
             (var_C + normalization.epsilon).rsqrt(),
             of_batch=training,
+            dtype=self._form,
         )
-        return spikes_TRC.view(-1, x.shape[1], height, width, channels).permute(0, 1, 4, 2, 3)
+        return spikes.with_rows(y.shape[1:-1])
 
 
 def _gain(stream: Stream, context: tuple[Tensor, ...], y_TBN: Tensor) -> Tensor:
@@ -108,30 +101,3 @@ def _gain(stream: Stream, context: tuple[Tensor, ...], y_TBN: Tensor) -> Tensor:
     if stream.dendrites is None:
         return torch.ones(y_TBN.shape[-1])
     return stream.dendrites.gains(*context).expand(y_TBN.shape[-1])
-
-
-def _channels_last(x: Tensor) -> Tensor:
-    return x.contiguous(memory_format=torch.channels_last) if x.dim() == 4 else x
-
-
-class _Convolution(torch.autograd.Function):
-    """A convolution whose two gradients are asked for one by one: together, oneDNN takes up to 1.4 times as long."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        ctx.stride = stride
-        return _channels_last(F.conv2d(x, weight, bias, stride))
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight = ctx.saved_tensors
-        grad_y = _channels_last(gradients[0])
-
-        def gradient(of_x: bool, of_weight: bool) -> tuple[Tensor, ...]:
-            sizes = ([weight.shape[0]], [ctx.stride] * 2, [0, 0], [1, 1], False, [0, 0], 1)
-            mask = [of_x, of_weight, of_weight]
-            return torch.ops.aten.convolution_backward(grad_y, x, weight, *sizes, mask)  # type: ignore[no-any-return]
-
-        grad_x = gradient(True, False)[0] if ctx.needs_input_grad[0] else None
-        return grad_x, *gradient(False, True)[1:], None
