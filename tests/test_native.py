@@ -87,8 +87,7 @@ def test_normalized_spikes_equal_batch_norm_and_neurons(dtype: torch.dtype, step
         y_SRC, weight_C, bias_C = (x.clone().requires_grad_() for x in (y, weight, bias))
         if is_native:
             mean_C, var_C = batch_moments(y_SRC.detach())
-            inverse_std_C = (var_C + 1e-5).rsqrt()
-            of = (y_SRC, weight_C, bias_C, mean_C, inverse_std_C)
+            of = (y_SRC, weight_C, bias_C, (mean_C, var_C), 1e-5)
             spikes = Neurons(config).normalized(*of, of_batch=True, dtype=dtype).numbers
         else:
             flat = y_SRC.flatten(0, 1).to(torch.float64)

@@ -59,7 +59,9 @@ def test_connections_and_their_weights_gradient(lanes, channels, places, outputs
     weight, bias = torch.randn(outputs, channels * places).to(dtype), torch.randn(outputs)
     close(panels.times(weight, bias), flat @ weight.double().T + bias, low)
     grad_y = torch.randn(lanes, outputs).to(dtype)
-    close(panels.weight_gradient(grad_y), grad_y.double().T @ flat, False)  # not rounded to bfloat16
+    grad_weight, grad_bias = panels.gradients(grad_y)  # not rounded to bfloat16
+    close(grad_weight, grad_y.double().T @ flat, False)
+    close(grad_bias, grad_y.double().sum(0), False)
 
 
 @settings(max_examples=60, deadline=None)
@@ -105,7 +107,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
         for number in (1, 2, 3):
             torch.set_num_threads(number)
             panels = Panels.of_images(as_bits(spikes), 40)
-            results.append((panels.times(weight, torch.ones(52)), panels.weight_gradient(grad_y)))
+            results.append((panels.times(weight, torch.ones(52)), *panels.gradients(grad_y)))
     finally:
         torch.set_num_threads(threads)
     for other in results[1:]:
@@ -129,13 +131,17 @@ def test_what_cplusplus_would_read_wrongly_is_refused() -> None:
         (torch.zeros(8, 40), torch.zeros(7)),
         (torch.zeros(8, 40), torch.zeros(8).double()),
         (torch.zeros(40, 8).T, torch.zeros(8)),
+        (torch.zeros(8, 40), torch.zeros(16)[::2]),
         (torch.zeros(8, 40).double(), torch.zeros(8)),
     ):
         with pytest.raises(ValueError, match="expected"):
             panels.times(weight, bias)
+    for words in (torch.zeros(2, 3, 1), torch.zeros(2, 3, 2, dtype=torch.int32)[..., :1]):
+        with pytest.raises(ValueError, match="expected contiguous int32"):
+            Panels.of_images(words, 3)
     for grad_y in (torch.zeros(5, 8), torch.zeros(8, 6).T, torch.zeros(6, 8, dtype=torch.float64)):
         with pytest.raises(ValueError, match="expected"):
-            panels.weight_gradient(grad_y)
+            panels.gradients(grad_y)
 
 
 @pytest.mark.parametrize("trunk", ["nature", "minatar", "mlp"])

@@ -5,6 +5,7 @@
 // says that every step shares one [R][C]. Sums run over a fixed number of parts, so they do not depend on the threads.
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <type_traits>
 #include <vector>
@@ -135,6 +136,7 @@ void unfire(const Neuron& n, const Y* y, long y_step, const float* scale, const 
         for (long i = 0; i < 2 * channels; i++) sums[i] += partial[part * 2 * channels + i];
 }
 
+// grad * scale + (y - center) * slope + constant.
 template <class Y>
 void combine(const float* grad, const Y* y, const float* scale, const float* center, const float* slope,
              const float* constant, Y* out, long rows, long channels, int threads) {
@@ -209,48 +211,67 @@ void with_types(bool low, bool other_low, F f) {  // all floats, all bfloat16, o
 extern "C" {
 
 // Spikes of T steps.
-void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const float* scale, const float* shift,
-              void* spikes, int spikes_low, long steps, long rows, long channels, int threads) {
+void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, void* spikes, int spikes_low, long steps, long rows, long channels, int threads) {
     with_flag(n->zero, [&](auto zero) {
         with_types(y_low, spikes_low, [&](auto y_, auto s_) {
-            fire<zero.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, (decltype(s_)*)spikes, steps, rows,
-                             channels, threads);
+            fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (decltype(s_)*)spikes,
+                             steps, rows, channels, threads);
         });
     });
 }
 
 // The same spikes as bits: channel c is bit c % 32 of words [T][R][ceil(C / 32)].
-void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const float* scale, const float* shift,
-                   void* words, long steps, long rows, long channels, int threads) {
+void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, void* words, long steps, long rows, long channels, int threads) {
     with_flag(n->zero, [&](auto zero) {
         with_type(y_low, [&](auto y_) {
-            fire<zero.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, (uint32_t*)words, steps, rows, channels,
-                             threads);
+            fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (uint32_t*)words, steps,
+                             rows, channels, threads);
         });
     });
 }
 
-// Gradients of the currents from those of the spikes; sums [2][C] must be zero before.
-void snn_unfire(const Neuron* n, const void* y, int y_low, long y_step, const float* scale, const float* shift,
-                const float* center, const void* grad_spikes, int grad_low, long g_step, float* grad,
-                double* sums, long steps, long rows, long channels, int threads) {
+// currents [4][C]: scale, shift, center, inverse deviation of y * scale + shift = (y - mean) * a / deviation + b; without
+// a mean, scale is a, shift b and the rest 0. Without b, 0.
+void snn_currents(const float* a, const float* b, const float* mean, const float* variance, float epsilon,
+                  float* currents, long channels) {
+    for (long c = 0; c < channels; c++) {
+        float inverse = mean ? 1.0f / std::sqrt(variance[c] + epsilon) : 0.0f;
+        float scale = mean ? a[c] * inverse : a[c], shift = b ? b[c] : 0.0f;
+        currents[c] = scale;
+        currents[channels + c] = mean ? shift - mean[c] * scale : shift;
+        currents[2 * channels + c] = mean ? mean[c] : 0.0f;
+        currents[3 * channels + c] = inverse;
+    }
+}
+
+// Gradients of y, and of a and b (grad_ab [2][C]), from those of the spikes. With an inverse deviation, mean and deviation
+// are those of y itself, and follow it. scratch is of y's size.
+void snn_unfire(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, const void* grad_spikes,
+                int grad_low, long g_step, float* scratch, void* grad_y, float* grad_ab, long steps, long rows,
+                long channels, int threads) {
+    const float *scale = currents, *shift = scale + channels, *center = shift + channels, *inverse = center + channels;
+    std::vector<double> sums(2 * channels, 0.0);
     with_flag(n->zero, [&](auto zero) {
         with_flag(n->fast_sigmoid, [&](auto fast) {
             with_types(y_low, grad_low, [&](auto y_, auto g_) {
                 unfire<zero.value, fast.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, center,
-                                               (const decltype(g_)*)grad_spikes, g_step, grad, sums, steps, rows,
-                                               channels, threads);
+                                               (const decltype(g_)*)grad_spikes, g_step, scratch, sums.data(), steps,
+                                               rows, channels, threads);
             });
         });
     });
-}
-
-// grad * scale + (y - center) * slope + constant.
-void snn_combine(const float* grad, const void* y, int y_low, const float* scale, const float* center,
-                 const float* slope, const float* constant, void* out, long rows, long channels, int threads) {
+    long all = y_step == 0 ? rows : steps * rows;
+    std::vector<float> slope(channels), constant(channels);
+    for (long c = 0; c < channels; c++) {
+        bool follows = inverse[c] != 0.0f;
+        grad_ab[c] = float(sums[channels + c]) * (follows ? inverse[c] : 1.0f);
+        grad_ab[channels + c] = float(sums[c]);
+        slope[c] = follows ? -scale[c] * inverse[c] * grad_ab[c] / float(all) : 0.0f;
+        constant[c] = follows ? -scale[c] * grad_ab[channels + c] / float(all) : 0.0f;
+    }
     with_type(y_low, [&](auto y_) {
         using Y = decltype(y_);
-        combine(grad, (const Y*)y, scale, center, slope, constant, (Y*)out, rows, channels, threads);
+        combine(scratch, (const Y*)y, scale, center, slope.data(), constant.data(), (Y*)grad_y, all, channels, threads);
     });
 }
 

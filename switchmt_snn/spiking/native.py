@@ -20,6 +20,10 @@ _SURROGATES = ("atan", "fast_sigmoid")
 """Those that ``native.cpp`` has."""
 
 
+_NOTHING = {dtype: torch.zeros((), dtype=dtype) for dtype in (torch.float32, torch.bfloat16)}
+"""Expanded to any shape, the way that gradients take where spikes are bits."""
+
+
 class _Neuron(ctypes.Structure):
     _fields_ = (
         ("beta", ctypes.c_float),
@@ -57,17 +61,6 @@ class Spikes(NamedTuple):
         return Spikes(self.numbers.unflatten(1, shape), bits)
 
 
-class Currents(NamedTuple):
-    """How currents come from synaptic products: ``y * scale + shift``, and what the gradient must know of it."""
-
-    scale_C: Tensor
-    shift_C: Tensor
-    center_C: Tensor
-    """The batch's mean; 0 without normalisation."""
-    inverse_std_C: Tensor | None
-    """Of the batch; None if scale and shift do not depend on it."""
-
-
 class Neurons:
     """T steps of a network's neurons on synaptic products ``[S, R, C]``, floats or bfloat16.
 
@@ -84,56 +77,53 @@ class Neurons:
         self._neuron = _Neuron(beta, config.threshold, slope, config.reset == "zero", fast_sigmoid)
         self.timesteps = config.timesteps
 
-    def gated(self, y_SRC: Tensor, gain_C: Tensor, dtype: torch.dtype) -> Spikes:
-        """Spikes for currents ``y * gain``; ``dtype`` as for :meth:`fire`."""
-        return self._spikes(y_SRC, gain_C.contiguous(), torch.zeros(y_SRC.shape[-1]), None, None, dtype)
+    def gated(self, y_SRC: Tensor, gain_C: Tensor | None, dtype: torch.dtype) -> Spikes:
+        """Spikes for currents ``y * gain`` (None: 1); ``dtype`` as for :meth:`fire`."""
+        gain_C = torch.ones(y_SRC.shape[-1]) if gain_C is None else gain_C.contiguous()
+        return self._spikes(y_SRC, gain_C, None, _currents(y_SRC, gain_C), dtype)
 
     def normalized(
         self,
         y_SRC: Tensor,
         weight_C: Tensor,
         bias_C: Tensor,
-        mean_C: Tensor,
-        inverse_std_C: Tensor,
+        moments: tuple[Tensor, Tensor],
+        epsilon: float,
         of_batch: bool,
         dtype: torch.dtype,
     ) -> Spikes:
-        """Spikes for currents ``(y - mean) * inverse_std * weight + bias``; ``dtype`` as for :meth:`fire`.
+        """Spikes for currents ``(y - mean) / sqrt(variance + epsilon) * weight + bias``; ``dtype`` as for :meth:`fire`.
 
-        ``of_batch``: mean and deviation are those of ``y`` itself, and the gradient goes through them; else there is no
-        gradient.
+        ``of_batch``: the moments (mean and variance) are those of ``y``, and the gradient goes through them; else
+        there is no gradient.
         """
+        currents_4C = _currents(y_SRC, weight_C, bias_C, moments, epsilon)
         if of_batch:
-            return self._spikes(y_SRC, weight_C, bias_C, mean_C, inverse_std_C, dtype)
-        scale_C = weight_C.detach() * inverse_std_C
-        return self._spikes(y_SRC.detach(), scale_C, bias_C.detach() - mean_C * scale_C, None, None, dtype)
+            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, dtype)
+        with torch.no_grad():
+            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, dtype)
 
     def _spikes(
-        self,
-        y_SRC: Tensor,
-        a_C: Tensor,
-        b_C: Tensor,
-        mean_C: Tensor | None,
-        inverse_std_C: Tensor | None,
-        dtype: torch.dtype,
+        self, y_SRC: Tensor, a_C: Tensor, b_C: Tensor | None, currents_4C: Tensor, dtype: torch.dtype
     ) -> Spikes:
-        what = (y_SRC, a_C, b_C, mean_C, inverse_std_C, self, dtype)
-        return Spikes(*_Spikes.apply(*what))  # type: ignore[no-untyped-call]
+        if torch.is_grad_enabled():
+            return Spikes(*_Spikes.apply(y_SRC, a_C, b_C, self, currents_4C, dtype))  # type: ignore[no-untyped-call]
+        return self._fired(y_SRC, currents_4C, dtype)
 
-    def fire(self, y_SRC: Tensor, scale_C: Tensor, shift_C: Tensor, dtype: torch.dtype) -> Tensor:
-        """Spikes ``[T, R, C]`` of currents ``y * scale + shift``, without gradient; as bits if ``dtype`` is int32:
-        ``[T, R, words]``, channel c being bit c % 32 of word c // 32.
+    def _fired(self, y_SRC: Tensor, currents_4C: Tensor, dtype: torch.dtype) -> Spikes:
+        spikes = self.fire(y_SRC, currents_4C, dtype)
+        if dtype != torch.int32:
+            return Spikes(spikes)
+        return Spikes(_NOTHING[y_SRC.dtype].expand(self.timesteps, *y_SRC.shape[1:]), spikes)
+
+    def fire(self, y_SRC: Tensor, currents_4C: Tensor, dtype: torch.dtype) -> Tensor:
+        """Spikes ``[T, R, C]``, without gradient; as bits if ``dtype`` is int32: ``[T, R, words]``, channel c being bit
+        c % 32 of word c // 32. The first two rows of ``currents`` are scale and shift.
 
         Raises:
-            ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``;
-                scale or shift are not contiguous float32.
+            ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``.
         """
         steps, rows, channels = y_SRC.shape
-        for numbers_C in (scale_C, shift_C):
-            if numbers_C.dtype != torch.float32 or numbers_C.shape != (channels,) or not numbers_C.is_contiguous():
-                raise ValueError(
-                    f"{numbers_C.dtype} {tuple(numbers_C.shape)}, expected float32 for {channels} channels"
-                )
         fitting = dtype in (torch.float32, torch.int32, y_SRC.dtype)
         if not y_SRC.is_contiguous() or steps not in (1, self.timesteps) or not fitting:
             raise ValueError(
@@ -142,37 +132,60 @@ class Neurons:
             )
         as_bits = dtype == torch.int32
         spikes = torch.empty(self.timesteps, rows, -(-channels // 32) if as_bits else channels, dtype=dtype)
-        currents = (*typed(y_SRC), _step(y_SRC), scale_C.data_ptr(), shift_C.data_ptr())
         where = (spikes.data_ptr(),) if as_bits else typed(spikes)
         fire = library().snn_fire_bits if as_bits else library().snn_fire
         sizes = (self.timesteps, rows, channels, torch.get_num_threads())
-        fire(ctypes.addressof(self._neuron), *currents, *where, *sizes)
+        fire(ctypes.addressof(self._neuron), *typed(y_SRC), _step(y_SRC), currents_4C.data_ptr(), *where, *sizes)
         return spikes
 
-    def unfire(self, y_SRC: Tensor, currents: Currents, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of the currents ``[S, R, C]``, and the sums ``[2, C]`` of it and of it times ``y - center``."""
+    def unfire(self, y_SRC: Tensor, currents_4C: Tensor, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients of ``y``, and ``[2, C]`` of gain (or weight) and bias."""
         steps, rows, channels = y_SRC.shape
-        grad_SRC = torch.empty(steps, rows, channels)
-        sums_2C = torch.zeros(2, channels, dtype=torch.float64)
+        scratch_SRC, grad_y_SRC = torch.empty(steps, rows, channels), torch.empty_like(y_SRC)
+        grad_2C = torch.empty(2, channels)
         if not (grad_TRC.stride(0) == 0 and grad_TRC[0].is_contiguous()):
             grad_TRC = grad_TRC.contiguous()
         library().snn_unfire(
             ctypes.addressof(self._neuron),
             *typed(y_SRC),
             _step(y_SRC),
-            currents.scale_C.data_ptr(),
-            currents.shift_C.data_ptr(),
-            currents.center_C.data_ptr(),
+            currents_4C.data_ptr(),
             *typed(grad_TRC),
             grad_TRC.stride(0),
-            grad_SRC.data_ptr(),
-            sums_2C.data_ptr(),
+            scratch_SRC.data_ptr(),
+            grad_y_SRC.data_ptr(),
+            grad_2C.data_ptr(),
             self.timesteps,
             rows,
             channels,
             torch.get_num_threads(),
         )
-        return grad_SRC, sums_2C.to(torch.float32)
+        return grad_y_SRC, grad_2C
+
+
+def _currents(
+    y_SRC: Tensor,
+    a_C: Tensor,
+    b_C: Tensor | None = None,
+    moments: tuple[Tensor, Tensor] | None = None,
+    epsilon: float = 0.0,
+) -> Tensor:
+    """How currents come from synaptic products, ``[4, C]``: scale, shift, mean and inverse deviation.
+
+    Raises:
+        ValueError: something is not contiguous float32 for every channel.
+    """
+    channels = y_SRC.shape[-1]
+    given = (a_C, b_C, *(moments or (None, None)))
+    for numbers_C in given:
+        if numbers_C is None:
+            continue
+        if numbers_C.dtype != torch.float32 or numbers_C.shape != (channels,) or not numbers_C.is_contiguous():
+            raise ValueError(f"{numbers_C.dtype} {tuple(numbers_C.shape)}, expected float32 for {channels} channels")
+    currents_4C = torch.empty(4, channels)
+    places = (None if numbers_C is None else numbers_C.data_ptr() for numbers_C in given)
+    library().snn_currents(*places, epsilon, currents_4C.data_ptr(), channels)
+    return currents_4C
 
 
 def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,58 +211,26 @@ def scaled_images(x_BCHW: Tensor, scale: float, dtype: torch.dtype) -> Tensor:
 
 
 class _Spikes(torch.autograd.Function):
-    """Spikes of ``y * scale + shift``; with ``inverse_std``, a and b are a normalisation's weight and bias."""
+    """The gradient's way through currents and neurons; a and b are gain or weight, and bias."""
 
     @staticmethod
     def forward(
         ctx: Any,
         y_SRC: Tensor,
-        a_C: Tensor,
-        b_C: Tensor,
-        mean_C: Tensor | None,
-        inverse_std_C: Tensor | None,
+        _: Tensor,
+        b_C: Tensor | None,
         neurons: Neurons,
+        currents_4C: Tensor,
         dtype: torch.dtype,
     ) -> tuple[Tensor, Tensor | None]:
-        if mean_C is None or inverse_std_C is None:
-            currents = Currents(a_C, b_C, torch.zeros_like(b_C), None)
-        else:
-            scale_C = a_C * inverse_std_C
-            currents = Currents(scale_C, b_C - mean_C * scale_C, mean_C, inverse_std_C)
-        ctx.save_for_backward(y_SRC, *currents)
-        ctx.neurons = neurons
-        spikes = neurons.fire(y_SRC, currents.scale_C, currents.shift_C, dtype)
-        if dtype != torch.int32:
-            return spikes, None
-        return torch.zeros((), dtype=y_SRC.dtype).expand(neurons.timesteps, *y_SRC.shape[1:]), spikes
+        ctx.save_for_backward(y_SRC, currents_4C)
+        ctx.neurons, ctx.has_bias = neurons, b_C is not None
+        return neurons._fired(y_SRC, currents_4C, dtype)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        y_SRC, *kept = ctx.saved_tensors
-        currents = Currents(*kept)
-        grad_SRC, (sum_C, product_C) = ctx.neurons.unfire(y_SRC, currents, gradients[0])
-        if currents.inverse_std_C is None:  # product_C: the center is 0
-            slope_C = constant_C = torch.zeros_like(sum_C)
-            grad_a_C = product_C
-        else:  # the batch's mean and deviation follow y
-            count = y_SRC.numel() // y_SRC.shape[-1]
-            grad_a_C = product_C * currents.inverse_std_C
-            slope_C = currents.scale_C * currents.inverse_std_C * grad_a_C / -count
-            constant_C = currents.scale_C * sum_C / -count
-        grad_y_SRC = torch.empty_like(y_SRC)
-        library().snn_combine(
-            grad_SRC.data_ptr(),
-            *typed(y_SRC),
-            currents.scale_C.data_ptr(),
-            currents.center_C.data_ptr(),
-            slope_C.data_ptr(),
-            constant_C.data_ptr(),
-            grad_y_SRC.data_ptr(),
-            y_SRC.shape[0] * y_SRC.shape[1],
-            y_SRC.shape[2],
-            torch.get_num_threads(),
-        )
-        return grad_y_SRC, grad_a_C, sum_C, None, None, None, None
+        grad_y_SRC, (grad_a_C, grad_b_C) = ctx.neurons.unfire(*ctx.saved_tensors, gradients[0])
+        return grad_y_SRC, grad_a_C, grad_b_C if ctx.has_bias else None, None, None, None
 
 
 def _step(y_SRC: Tensor) -> int:

@@ -34,12 +34,12 @@ _FLAGS = (
 )
 _KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_long, "f": ctypes.c_float}
 _ARGUMENTS = {
-    "snn_fire": "ppilpppillli",
-    "snn_unfire": "ppilppppilppllli",
-    "snn_combine": "ppippppplli",
+    "snn_currents": "ppppfpl",
+    "snn_fire": "ppilppillli",
+    "snn_fire_bits": "ppilppllli",
+    "snn_unfire": "ppilppilpppllli",
     "snn_moments": "pipplli",
     "snn_images": "pfpillli",
-    "snn_fire_bits": "ppilpppllli",
 }
 """Pointers, ints, longs and floats that the functions take."""
 _PRODUCTS = {
@@ -47,7 +47,7 @@ _PRODUCTS = {
     "snn_flat": "ppllli",
     "snn_transpose": "pplli",
     "snn_multiply": "pipppllli",
-    "snn_multiply_transposed": "pippllli",
+    "snn_multiply_transposed": "pipppllli",
 }
 """Those that are there if ``snn_has_products`` says so."""
 

@@ -66,7 +66,8 @@ class NativeNetwork:
         outputs = {}
         for name, stream in network.streams.items():
             y_TBN = features.connected(synapses[name])
-            gain_N = _gain(cast(Stream, stream), context[name], y_TBN)
+            dendrites = cast(Stream, stream).dendrites
+            gain_N = None if dendrites is None else dendrites.gains(*context[name]).expand(y_TBN.shape[-1])
             spikes_TBN = self._neurons.gated(y_TBN, gain_N, torch.float32).numbers
             outputs[name] = network.read_out(cast(Stream, stream), spikes_TBN)
         return network.combine(outputs)
@@ -77,7 +78,7 @@ class NativeNetwork:
         """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``, as the next layer reads them."""
         if layer.normalization is None:
             y_SBN = Features(x).connected(synapses)
-            return self._neurons.gated(y_SBN, torch.ones(y_SBN.shape[-1]), self._form)
+            return self._neurons.gated(y_SBN, None, self._form)
         y = convolved(x, synapses)
         y_SRC = y.flatten(1, -2)
         normalization, (mean_C, var_C) = layer.normalization, context
@@ -88,16 +89,9 @@ class NativeNetwork:
             y_SRC,
             normalization.weight,
             normalization.bias,
-            mean_C,
-            (var_C + normalization.epsilon).rsqrt(),
+            (mean_C, var_C),
+            normalization.epsilon,
             of_batch=training,
             dtype=self._form,
         )
         return spikes.with_rows(y.shape[1:-1])
-
-
-def _gain(stream: Stream, context: tuple[Tensor, ...], y_TBN: Tensor) -> Tensor:
-    """The dendrites' gain of every neuron ``[N]``; 1 without dendrites."""
-    if stream.dendrites is None:
-        return torch.ones(y_TBN.shape[-1])
-    return stream.dendrites.gains(*context).expand(y_TBN.shape[-1])

@@ -1,7 +1,7 @@
 // Products of a matrix of numbers and a matrix of spikes, a spike being one bit. For four inputs, the sixteen sums that
 // their weights can have lie in one register, and four bits choose one of them: the method of the four Russians (Arlazarov
-// et al., 1970) with a permutation as its table. That is 64 exact products per instruction, in single precision; a
-// fused multiply-add has 16.
+// et al., 1970) with a permutation as its table. One permutation is 64 products, in single precision and without
+// rounding them; a fused multiply-add is 16.
 //
 // Spikes [N lanes][K bits] lie in panels of 64 lanes: bit k of lane n is bit k % 32 of
 // panels[(n / 64 * words + k / 32) * 64 + n % 64], words = ceil(K / 32). Bits and lanes beyond K and N are 0.
@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <numeric>
 #include <vector>
 
 #include "native_numbers.h"
@@ -31,15 +32,23 @@ constexpr long ROWS = 4;     // of the numbers, worked on together
 constexpr long CHUNK = 576;  // bits whose tables stay in the first cache
 constexpr long SUPER = 32;   // panels that one table serves before the next one is made
 
+// a * 1: half of the additions below are fused multiply-adds, which other units of the processor compute.
+inline __m512 ones() {
+    __m512 one = _mm512_set1_ps(1.0f);
+    asm volatile("" : "+v"(one));  // the compiler shall not see that it is one
+    return one;
+}
+
 // The 16 sums of every 4 numbers of each row: tables [bits / 4][ROWS][16] from a [ROWS][CHUNK].
 void make_tables(const float* a, long bits, float* tables) {
+    __m512 one = ones();
     for (long k = 0; k < bits; k += 4)
         for (long m = 0; m < ROWS; m++, tables += 16) {
             const float* four = a + m * CHUNK + k;
             __m512 sums = _mm512_maskz_mov_ps(0xAAAA, _mm512_set1_ps(four[0]));
-            sums = _mm512_mask_add_ps(sums, 0xCCCC, sums, _mm512_set1_ps(four[1]));
+            sums = _mm512_mask3_fmadd_ps(_mm512_set1_ps(four[1]), one, sums, 0xCCCC);
             sums = _mm512_mask_add_ps(sums, 0xF0F0, sums, _mm512_set1_ps(four[2]));
-            sums = _mm512_mask_add_ps(sums, 0xFF00, sums, _mm512_set1_ps(four[3]));
+            sums = _mm512_mask3_fmadd_ps(_mm512_set1_ps(four[3]), one, sums, 0xFF00);
             _mm512_store_ps(tables, sums);
         }
 }
@@ -47,8 +56,7 @@ void make_tables(const float* a, long bits, float* tables) {
 // sums [ROWS][LANES] += tables . bits of one panel.
 void add_panel(const float* tables, const uint32_t* panel, long words, float* sums) {
     constexpr long VECTORS = LANES / 16;
-    __m512 one = _mm512_set1_ps(1.0f), total[ROWS][VECTORS];
-    asm volatile("" : "+v"(one));
+    __m512 one = ones(), total[ROWS][VECTORS];
     for (long m = 0; m < ROWS; m++)
         for (long v = 0; v < VECTORS; v++) total[m][v] = _mm512_setzero_ps();
     for (long w = 0; w < words; w++, panel += LANES) {
@@ -60,7 +68,6 @@ void add_panel(const float* tables, const uint32_t* panel, long words, float* su
                 asm("" : "+v"(table));  // kept in its register, not read again for every permutation
                 for (long v = 0; v < VECTORS; v++) {
                     __m512 chosen = _mm512_permutexvar_ps(bits[v], table);  // reads the lowest four bits
-                    // Half of the additions as 1 * chosen + total, the same number, which other units compute.
                     total[m][v] = (m + v) % 2 ? _mm512_add_ps(total[m][v], chosen)
                                               : _mm512_fmadd_ps(chosen, one, total[m][v]);
                 }
@@ -103,9 +110,18 @@ void put_lanes_first(const float* sums, const float* bias, C* out, long lanes, l
     }
 }
 
-// LANES_FIRST: out [N][M] = spikes . a^T + bias of a [M][K]; else out [M][N] = (spikes . a)^T of a [K][M].
-template <bool LANES_FIRST, class A, class C>
-void multiply(const A* a, const float* bias, const uint32_t* panels, C* out, long M, long K, long N, int threads) {
+double total(const float* numbers, long count) {  // a multiple of 16
+    __m512 sums = _mm512_setzero_ps();
+    for (long i = 0; i < count; i += 16) sums = _mm512_add_ps(sums, _mm512_loadu_ps(numbers + i));
+    float parts[16];
+    _mm512_storeu_ps(parts, sums);
+    return std::accumulate(parts, parts + 16, 0.0);
+}
+
+// LANES_FIRST: out [N][M] = spikes . a^T + bias of a [M][K]; else out [M][N] = (spikes . a)^T of a [K][M], and bias [M]
+// becomes the sums of a over K.
+template <bool LANES_FIRST, class A, class C, class B>
+void multiply(const A* a, B* bias, const uint32_t* panels, C* out, long M, long K, long N, int threads) {
     long words = (K + 31) / 32, all = (N + LANES - 1) / LANES, blocks = (M + ROWS - 1) / ROWS;
     long supers = std::min(all, std::max((all + SUPER - 1) / SUPER, (threads + blocks - 1) / blocks));
 #pragma omp parallel num_threads(threads)
@@ -117,6 +133,7 @@ void multiply(const A* a, const float* bias, const uint32_t* panels, C* out, lon
         for (long task = 0; task < supers * blocks; task++) {
             long super = task / blocks, m = task % blocks * ROWS, here = std::min(ROWS, M - m);
             long first = all * super / supers, count = all * (super + 1) / supers - first;
+            double whole[ROWS] = {};
             std::fill(sums, sums + count * ROWS * LANES, 0.0f);
             for (long k = 0; k < words * 32; k += CHUNK) {
                 long bits = std::min(CHUNK, words * 32 - k), real = std::min(bits, K - k);
@@ -126,11 +143,15 @@ void multiply(const A* a, const float* bias, const uint32_t* panels, C* out, lon
                     for (long i = 0; i < real; i++) some[r * CHUNK + i] = number(a[(m + r) * K + k + i]);
                 for (long i = 0; i < real && !LANES_FIRST; i++)
                     for (long r = 0; r < here; r++) some[r * CHUNK + i] = number(a[(k + i) * M + m + r]);
+                for (long r = 0; r < ROWS && !LANES_FIRST; r++)
+                    whole[r] += total(some + r * CHUNK, bits);
                 make_tables(some, bits, tables);
                 for (long p = 0; p < count; p++)
                     add_panel(tables, panels + ((first + p) * words + k / 32) * LANES, bits / 32,
                               sums + p * ROWS * LANES);
             }
+            if constexpr (!LANES_FIRST)
+                if (super == 0) std::copy(whole, whole + here, bias + m);
             for (long p = 0; p < count; p++) {
                 const float* from = sums + p * ROWS * LANES;
                 long n = (first + p) * LANES, lanes = std::min(LANES, N - n);
@@ -217,13 +238,13 @@ void snn_multiply(const void* a, int low, const float* bias, const uint32_t* pan
         multiply<true>((const float*)a, bias, panels, (float*)y, M, K, N, threads);
 }
 
-// out [M][N] = a [K][M]^T . spikes [N][K]^T in floats.
-void snn_multiply_transposed(const void* a, int low, const uint32_t* panels, float* out, long M, long K, long N,
-                             int threads) {
+// out [M][N] = a [K][M]^T . spikes [N][K]^T, and the sums [M] of a over K, in floats.
+void snn_multiply_transposed(const void* a, int low, const uint32_t* panels, float* out, float* sums, long M, long K,
+                             long N, int threads) {
     if (low)
-        multiply<false>((const BFloat16*)a, nullptr, panels, out, M, K, N, threads);
+        multiply<false>((const BFloat16*)a, sums, panels, out, M, K, N, threads);
     else
-        multiply<false>((const float*)a, nullptr, panels, out, M, K, N, threads);
+        multiply<false>((const float*)a, sums, panels, out, M, K, N, threads);
 }
 }
 #endif

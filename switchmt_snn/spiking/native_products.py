@@ -1,4 +1,4 @@
-"""Synaptic products with their gradients. Those of spikes that are kept as bits are exact sums in float32
+"""Synaptic products with their gradients. Those of spikes that are kept as bits are float32 sums of weights
 (``native_products.cpp``, AVX-512), at several times the speed of multiplications; all others are PyTorch's (oneDNN).
 
 Shapes: T steps, B batch, I = T * B images, H, W places, C channels in, O channels out, K inputs of an output.
@@ -30,13 +30,20 @@ class Synapses(NamedTuple):
     layer: nn.Linear | nn.Conv2d
     weight: Tensor
     bias: Tensor
+    matrix: Tensor
+    """The weights ``[O, bits]`` for products of bits, a convolution's filled up to whole words of channels."""
 
     @classmethod
     def of(cls, layer: nn.Linear | nn.Conv2d, dtype: torch.dtype) -> Synapses:
         """As the parameters are now."""
         with torch.no_grad():
-            bias = cast(Tensor, layer.bias)
-            return cls(layer, channels_last(layer.weight.to(dtype)), bias.to(dtype))
+            weight = matrix = channels_last(layer.weight.to(dtype))
+            if weight.dim() == 4:
+                matrix = weight.permute(0, 2, 3, 1)
+                if missing := -weight.shape[1] % 32:
+                    matrix = F.pad(matrix, (0, missing))
+                matrix = matrix.flatten(1)
+            return cls(layer, weight, cast(Tensor, layer.bias).to(dtype), matrix)
 
     @property
     def stride(self) -> int:
@@ -58,21 +65,29 @@ class Panels(NamedTuple):
 
     @classmethod
     def of_windows(cls, bits_IHWw: Tensor, kernel: int, stride: int) -> Panels:
-        """A lane for every window of a convolution without padding; its bits are places times whole words."""
+        """A lane for every window of a convolution without padding; its bits are places times whole words.
+
+        Raises:
+            ValueError: the words are not contiguous int32.
+        """
         images, height, width, words = bits_IHWw.shape
         lanes = images * _outputs(height, kernel, stride) * _outputs(width, kernel, stride)
         panels = cls.empty(lanes, kernel * kernel * words * 32)
         sizes = (*bits_IHWw.shape, kernel, stride, torch.get_num_threads())
-        library().snn_windows(bits_IHWw.data_ptr(), panels.words.data_ptr(), *sizes)
+        library().snn_windows(_words(bits_IHWw), panels.words.data_ptr(), *sizes)
         return panels
 
     @classmethod
     def of_images(cls, bits_Iw: Tensor, channels: int) -> Panels:
-        """A lane for every image ``[I, ..., words]``; its bits are in the order ``[C, places]``."""
+        """A lane for every image ``[I, ..., words]``; its bits are in the order ``[C, places]``.
+
+        Raises:
+            ValueError: the words are not contiguous int32.
+        """
         images, *sides, _ = bits_Iw.shape
         panels = cls.empty(images, channels * math.prod(sides))
         sizes = (images, math.prod(sides), channels, torch.get_num_threads())
-        library().snn_flat(bits_Iw.data_ptr(), panels.words.data_ptr(), *sizes)
+        library().snn_flat(_words(bits_Iw), panels.words.data_ptr(), *sizes)
         return panels
 
     def transposed(self) -> Panels:
@@ -90,20 +105,19 @@ class Panels(NamedTuple):
         """
         outputs = weight_OK.shape[0]
         fitting = weight_OK.shape == (outputs, self.bits) and bias_O.shape == (outputs,)
-        if not fitting or bias_O.dtype != torch.float32 or not weight_OK.is_contiguous():
+        contiguous = weight_OK.is_contiguous() and bias_O.is_contiguous()
+        if not fitting or bias_O.dtype != torch.float32 or not contiguous:
             raise ValueError(
                 f"weights {tuple(weight_OK.shape)} with strides {weight_OK.stride()} and bias {bias_O.dtype} "
-                f"{tuple(bias_O.shape)}, expected contiguous weights for {self.bits} inputs and as many float32 biases"
+                f"{tuple(bias_O.shape)}, expected, both contiguous, weights for {self.bits} inputs and as many float32 biases"
             )
         y = torch.empty(self.lanes, outputs, dtype=weight_OK.dtype)
         sizes = (outputs, self.bits, self.lanes, torch.get_num_threads())
-        library().snn_multiply(
-            *typed(weight_OK), bias_O.contiguous().data_ptr(), self.words.data_ptr(), y.data_ptr(), *sizes
-        )
+        library().snn_multiply(*typed(weight_OK), bias_O.data_ptr(), self.words.data_ptr(), y.data_ptr(), *sizes)
         return y
 
-    def weight_gradient(self, grad_y: Tensor) -> Tensor:
-        """float32 ``[O, bits]``: the weights' gradient from that of the products ``[lanes, O]``.
+    def gradients(self, grad_y: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the weights ``[O, bits]`` and the bias ``[O]``, float32, from that of the products ``[lanes, O]``.
 
         Raises:
             ValueError: the gradient does not fit, or is not contiguous.
@@ -113,11 +127,12 @@ class Panels(NamedTuple):
                 f"gradient {tuple(grad_y.shape)} with strides {grad_y.stride()}, expected contiguous rows for "
                 f"{self.lanes} lanes"
             )
-        grad = torch.empty(grad_y.shape[1], self.bits)
-        sizes = (grad_y.shape[1], self.lanes, self.bits, torch.get_num_threads())
-        words = self.transposed().words
-        library().snn_multiply_transposed(*typed(grad_y), words.data_ptr(), grad.data_ptr(), *sizes)
-        return grad
+        outputs, turned = grad_y.shape[1], self.transposed()
+        grad_weight, grad_bias = torch.empty(outputs, self.bits), torch.empty(outputs)
+        places = (turned.words.data_ptr(), grad_weight.data_ptr(), grad_bias.data_ptr())
+        sizes = (outputs, self.lanes, self.bits, torch.get_num_threads())
+        library().snn_multiply_transposed(*typed(grad_y), *places, *sizes)
+        return grad_weight, grad_bias
 
 
 def convolved(x: Spikes, synapses: Synapses) -> Tensor:
@@ -126,11 +141,12 @@ def convolved(x: Spikes, synapses: Synapses) -> Tensor:
     steps, (height, width) = x.numbers.shape[:2], x.numbers.shape[2:4]
     numbers_ICHW = x.numbers.flatten(0, 1).permute(0, 3, 1, 2)
     if x.bits is None:
-        y = _Convolution.apply(numbers_ICHW, weight, bias, *synapses[1:], stride)  # type: ignore[no-untyped-call]
+        what = (numbers_ICHW, weight, bias, synapses.weight, synapses.bias, stride)
+        y = _Convolution.apply(*what)  # type: ignore[no-untyped-call]
         return y.permute(0, 2, 3, 1).unflatten(0, steps)  # type: ignore[no-any-return]
     panels = Panels.of_windows(x.bits.flatten(0, 1), weight.shape[-1], stride)
-    what = (numbers_ICHW, weight, bias, synapses.weight, panels, stride)
-    y = _SpikeConvolution.apply(*what)  # type: ignore[no-untyped-call]
+    of_bits = (numbers_ICHW, weight, bias, synapses, panels, stride)
+    y = _SpikeConvolution.apply(*of_bits)  # type: ignore[no-untyped-call]
     sides = (_outputs(side, weight.shape[-1], stride) for side in (height, width))
     return y.view(*steps, *sides, -1)  # type: ignore[no-any-return]
 
@@ -149,16 +165,24 @@ class Features:
         """A layer's products ``[T, B, O]``."""
         weight, bias = synapses.layer.weight, synapses.layer.bias
         if self._panels is None:
-            y = _Linear.apply(self._numbers, weight, bias, *synapses[1:])  # type: ignore[no-untyped-call]
+            what = (self._numbers, weight, bias, synapses.weight, synapses.bias)
+            y = _Linear.apply(*what)  # type: ignore[no-untyped-call]
         else:
-            what = (self._numbers, weight, bias, synapses.weight, self._panels)
-            y = _SpikeLinear.apply(*what)  # type: ignore[no-untyped-call]
+            of_bits = (self._numbers, weight, bias, synapses, self._panels)
+            y = _SpikeLinear.apply(*of_bits)  # type: ignore[no-untyped-call]
         return y.unflatten(0, self._steps)  # type: ignore[no-any-return]
 
 
 def channels_last(x: Tensor) -> Tensor:
     """The same numbers, those of images with channels innermost."""
     return x.contiguous(memory_format=torch.channels_last) if x.dim() == 4 else x
+
+
+def _words(bits: Tensor) -> int:
+    """Where they lie; ValueError for what C++ would read wrongly."""
+    if bits.dtype != torch.int32 or not bits.is_cpu or not bits.is_contiguous():
+        raise ValueError(f"{bits.dtype} with strides {bits.stride()} on {bits.device}, expected contiguous int32 words")
+    return bits.data_ptr()
 
 
 def _outputs(side: int, kernel: int, stride: int) -> int:
@@ -171,12 +195,11 @@ def _outputs(side: int, kernel: int, stride: int) -> int:
 class _SpikeConvolution(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, numbers: Tensor, _: Tensor, bias: Tensor, weight: Tensor, panels: Panels, stride: int
+        ctx: Any, numbers: Tensor, _: Tensor, bias: Tensor, synapses: Synapses, panels: Panels, stride: int
     ) -> Tensor:
-        ctx.save_for_backward(weight)
+        ctx.save_for_backward(synapses.weight)
         ctx.panels, ctx.stride, ctx.sides = panels, stride, numbers.shape[2:]
-        missing = -weight.shape[1] % 32  # channels that fill up the last word
-        return panels.times(F.pad(weight.permute(0, 2, 3, 1), (0, missing)).flatten(1), bias.detach())
+        return panels.times(synapses.matrix, bias.detach())
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -185,8 +208,9 @@ class _SpikeConvolution(torch.autograd.Function):
         outputs = [_outputs(side, kernel, ctx.stride) for side in ctx.sides]
         grad_y_IOhw = grad_y.view(-1, *outputs, out_channels).permute(0, 3, 1, 2)
         grad_x = _input_gradient(grad_y_IOhw, weight, ctx.stride, ctx.sides)
-        grad_OkkC = ctx.panels.weight_gradient(grad_y).view(out_channels, kernel, kernel, -1)[..., :channels]
-        return grad_x, grad_OkkC.permute(0, 3, 1, 2), grad_y.sum(0, dtype=torch.float32), None, None, None
+        grad_weight, grad_bias = ctx.panels.gradients(grad_y)
+        grad_OkkC = grad_weight.view(out_channels, kernel, kernel, -1)[..., :channels]
+        return grad_x, grad_OkkC.permute(0, 3, 1, 2), grad_bias, None, None, None
 
 
 def _input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: tuple[int, int]) -> Tensor:
@@ -206,15 +230,15 @@ def _input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: tuple[in
 
 class _SpikeLinear(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, numbers: Tensor, _: Tensor, bias: Tensor, weight: Tensor, panels: Panels) -> Tensor:
-        ctx.save_for_backward(weight)
+    def forward(ctx: Any, numbers: Tensor, _: Tensor, bias: Tensor, synapses: Synapses, panels: Panels) -> Tensor:
+        ctx.save_for_backward(synapses.weight)
         ctx.panels = panels
-        return panels.times(weight, bias.detach())
+        return panels.times(synapses.matrix, bias.detach())
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (weight,), grad_y = ctx.saved_tensors, gradients[0].contiguous()
-        return grad_y @ weight, ctx.panels.weight_gradient(grad_y), grad_y.sum(0, dtype=torch.float32), None, None
+        return grad_y @ weight, *ctx.panels.gradients(grad_y), None, None
 
 
 class _Convolution(torch.autograd.Function):
