@@ -35,8 +35,9 @@ GAME = "breakout"
 BATCH, UPDATE_EVERY, WARM_UP, EPSILON = 32, 4, 400, 0.1
 PLAIN = "plain loop over snn.Leaky"
 OURS: dict[str, dict[str, Any]] = {
-    "ours, default": {"engine": "eager"},
+    "ours, eager": {"engine": "eager"},
     "ours, compiled": {"engine": "compiled"},
+    "ours, native": {"engine": "native"},
     "ours, compiled, bfloat16": {"engine": "compiled", "precision": "bfloat16"},
     "ours, native, bfloat16": {"engine": "native", "precision": "bfloat16"},
     "ours, native, bfloat16, overlap": {"engine": "native", "precision": "bfloat16", "overlap": True},

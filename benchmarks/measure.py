@@ -15,6 +15,7 @@ import torch
 from torch import nn
 
 from switchmt_snn.learning.run_folder import processor
+from switchmt_snn.spiking.native_products import Panels
 
 PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "ale-py", "zstandard", "onnxruntime")
 
@@ -41,6 +42,14 @@ def matmul_gflops(dtype: torch.dtype, device: str = "cpu", size: int = 2048) -> 
             torch.cuda.synchronize()
 
     return 2.0 * size**3 / times_ms(product, 10, warmup=2)["min_ms"] / 1e6
+
+
+def spike_product_gflops(lanes: int = 16384, bits: int = 2048, outputs: int = 256) -> float:
+    """The machine's ceiling for products of spikes that are bits, as :func:`matmul_gflops` counts operations."""
+    panels = Panels.empty(lanes, bits)
+    panels.words.random_()
+    weight, bias = torch.randn(outputs, bits), torch.zeros(outputs)
+    return 2.0 * lanes * bits * outputs / times_ms(lambda: panels.times(weight, bias), 10, warmup=2)["min_ms"] / 1e6
 
 
 def read_gigabytes_per_s(megabytes: int = 256) -> float:

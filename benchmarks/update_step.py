@@ -8,6 +8,7 @@ left out.
 
 The physical limit of a variant is the time of its products alone (forward for Q*, Q and training, backward for weights
 and inputs; the first layer once for all T) at the speed of a large matrix product of its precision on this machine.
+Where native updates keep spikes as bits, products of spikes count at the speed of a large product of bits instead.
 """
 
 from __future__ import annotations
@@ -20,14 +21,21 @@ import json
 import statistics
 from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from benchmarks.measure import environment, interleaved_ms, matmul_gflops, network_macs, summary
+from benchmarks.measure import (
+    environment,
+    interleaved_ms,
+    matmul_gflops,
+    network_macs,
+    spike_product_gflops,
+    summary,
+)
 from benchmarks.peers import ACTIONS, PlainLoop, spikingjelly_network
 from switchmt_snn import config_io
 from switchmt_snn.config import ExperimentConfig, resolve
@@ -35,6 +43,7 @@ from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.machine import keep_freed_memory
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.spiking.native_products import spikes_as_bits
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
@@ -83,12 +92,21 @@ def our_learner(config: ExperimentConfig, suite: TaskSuite, device: str) -> Lear
     return Learner(network, resolved.learning, suite.valid_actions_KA, torch.device(device), 1)
 
 
-def update_gigaoperations(learner: Learner, batch: Batch) -> float:
+class Work(NamedTuple):
     """Operations of an update's products in 1e9, two for a multiply-accumulate."""
-    observations = np.asarray(torch.as_tensor(batch.observations).cpu())
-    macs = network_macs(learner.network, lambda: learner.act(observations, 0))
-    forward, first = sum(macs.values()), next(iter(macs.values()))
-    return 2e-9 * (3 * forward + 2 * forward - first)  # no gradient for the observations
+
+    of_spikes: float
+    """Forward, and for the weights' gradients: one factor is spikes (or activations)."""
+    other: float
+    """The first layer's, and for the gradients of spikes."""
+
+    @classmethod
+    def of(cls, learner: Learner, batch: Batch) -> Work:
+        """A learner's, for batches like this one."""
+        observations = np.asarray(torch.as_tensor(batch.observations).cpu())
+        macs = network_macs(learner.network, lambda: learner.act(observations, 0))
+        first, later = next(iter(macs.values())), sum(list(macs.values())[1:])
+        return cls(2e-9 * 4 * later, 2e-9 * (4 * first + later))
 
 
 def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Callable[[], None]], dict[str, float]]:
@@ -124,11 +142,13 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
                     learning=replace(base.learning, precision=precision, engine=engine),
                 )
                 learner = our_learner(config, suite, device)
-                work[label] = update_gigaoperations(learner, batch)
+                work[label] = Work.of(learner, batch)
                 name = f"{label}, {precision}, {engine}"
                 steps[name] = functools.partial(learner.update, batch, 0)
-                limits[name] = work[label] / gflops[precision] * 1e3
-    limits |= {name: work["ours"] / gflops[precision] * 1e3 for name, precision in precisions.items()}
+                has_bits = engine == "native" and spikes_as_bits(getattr(torch, precision))
+                of_spikes = spike_product_gflops() if has_bits else gflops[precision]
+                limits[name] = 1e3 * (work[label].of_spikes / of_spikes + work[label].other / gflops[precision])
+    limits |= {name: sum(work["ours"]) / gflops[precision] * 1e3 for name, precision in precisions.items()}
     return steps, limits
 
 

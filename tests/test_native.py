@@ -192,21 +192,25 @@ def test_what_it_has_no_code_for_is_refused_by_name(setting: dict[str, Any], nam
         machine.settle(asked, None, CPU)
 
 
-def test_auto_is_native_in_bfloat16_on_the_nature_trunk(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("has_bits", [True, False])
+def test_auto_is_native_on_the_nature_trunk(has_bits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In float32 only where the processor has products of bits."""
     monkeypatch.setattr(machine, "native_obstacle", lambda config, device: None)
-    nature = {"network": {"trunk": "nature"}, "learning": {"precision": "bfloat16"}}
-    settled, words = machine.settle(small_config(**nature), None, CPU)
-    assert settled.learning.engine == "native"
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512" if has_bits else "AVX2")
+
+    def settled(trunk: str, precision: str, engine: str = "auto") -> tuple[str, list[str]]:
+        asked = small_config(network={"trunk": trunk}, learning={"precision": precision, "engine": engine})
+        config, words = machine.settle(asked, None, CPU)
+        return config.learning.engine, words
+
+    engine, words = settled("nature", "bfloat16")
+    assert engine == "native"
     assert "C++" in words[-1]
-    for other in (
-        {**nature, "network": {"trunk": "minatar"}},
-        {**nature, "learning": {"precision": "float32"}},
-        {**nature, "learning": {"precision": "bfloat16", "engine": "eager"}},
-    ):
-        assert machine.settle(small_config(**other), None, CPU)[0].learning.engine == "eager"
+    assert settled("nature", "float32")[0] == ("native" if has_bits else "eager")
+    assert settled("minatar", "bfloat16")[0] == settled("nature", "bfloat16", "eager")[0] == "eager"
     monkeypatch.setattr(machine, "native_obstacle", lambda config, device: "expected luck")
-    settled, words = machine.settle(small_config(**nature), None, CPU)
-    assert settled.learning.engine == "eager"
+    engine, words = settled("nature", "bfloat16")
+    assert engine == "eager"
     assert "expected luck" in words[-1]
 
 

@@ -13,13 +13,13 @@ from switchmt_snn.config import resolve
 from switchmt_snn.spiking import native_library, native_network
 from switchmt_snn.spiking.native import Spikes
 from switchmt_snn.spiking.native_network import NativeNetwork
-from switchmt_snn.spiking.native_products import Panels, Synapses, convolved, has_spike_products
+from switchmt_snn.spiking.native_products import Panels, Synapses, convolved, spikes_as_bits
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from tests.conftest import small_config
 
 pytestmark = [
     pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler"),
-    pytest.mark.skipif(native_library.problem() is None and not has_spike_products(), reason="no AVX-512"),
+    pytest.mark.skipif(native_library.problem() is None and not spikes_as_bits(torch.float32), reason="no AVX-512"),
 ]
 
 
@@ -81,7 +81,7 @@ def test_convolutions_and_all_their_gradients(batch, channels, sides, kernel, st
     layer = nn.Conv2d(channels, outputs, kernel, stride)
     spikes = random_spikes(2, batch, *sides, channels)
     way = torch.zeros(()).to(dtype).expand(spikes.shape).requires_grad_()
-    y = convolved(Spikes(way, as_bits(spikes)), Synapses.of(layer, dtype))
+    y = convolved(Spikes(way, as_bits(spikes)), Synapses.of([layer], dtype))
     weights = torch.randn(y.shape).to(dtype)
     (y * weights).sum().backward()
     exact = nn.Conv2d(channels, outputs, kernel, stride).double()
@@ -157,7 +157,7 @@ def test_a_processor_without_the_instructions_computes_the_same(
     x = (torch.rand(5, 4, side, side) < 0.4).to(torch.uint8)
     results = []
     for has in (True, False):
-        monkeypatch.setattr(native_network, "has_spike_products", lambda has=has: has)
+        monkeypatch.setattr(native_network, "spikes_as_bits", lambda dtype, has=has: has)
         network = build_network(config.network, spec, 1)
         native = NativeNetwork(network, None)
         inputs = native.inputs(x, torch.Generator().manual_seed(0))

@@ -86,7 +86,7 @@ def _settle_engine(
     if engine == "native" or (engine == "auto" and native_pays(config, precision, device)):
         obstacle = native_obstacle(config, device)
         if obstacle is None:
-            said = "updates run natively: neuron layers in C++ (learning.engine=eager does without)"
+            said = "updates run natively: spikes and neurons in C++ (learning.engine=eager does without)"
             return "native", [said] if engine == "auto" else []
         if engine == "native":
             raise unavailable("a spiking network on a CPU and a C++ compiler (g++, or what CXX names)", obstacle)
@@ -135,11 +135,11 @@ def compiling_pays(config: ExperimentConfig) -> bool:
 
 
 def native_pays(config: ExperimentConfig, precision: str, device: torch.device) -> bool:
-    """Whether ``auto`` takes the native engine: with bfloat16 products, neurons are what takes time.
-
-    In float32 products take most of it (docs/performance.md), and MinAtar's small network is faster compiled.
+    """Whether ``auto`` takes the native engine, which is the fastest for the nature trunk (docs/performance.md) if its
+    products of spikes are those of bits, or the others are bfloat16. MinAtar's small network is faster compiled.
     """
-    return device.type == "cpu" and precision == "bfloat16" and config.network.trunk == "nature"
+    has_bits = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+    return device.type == "cpu" and config.network.trunk == "nature" and (has_bits or precision == "bfloat16")
 
 
 def native_obstacle(config: ExperimentConfig, device: torch.device) -> str | None:

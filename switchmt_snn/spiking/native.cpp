@@ -19,7 +19,6 @@
 namespace {
 
 constexpr long PARTS = 64;
-constexpr long WIDTH = 32;  // channels that are worked on together
 
 struct Neuron {
     float beta, threshold, slope;  // the last one of the surrogate gradient
@@ -27,24 +26,24 @@ struct Neuron {
 };
 
 template <bool FAST_SIGMOID>
-inline float surrogate(const Neuron& n, float x) {
+inline Lanes surrogate(const Neuron& n, Lanes x) {
     constexpr float half_pi = 1.57079632679489661923f;
-    float z = FAST_SIGMOID ? 1.0f + n.slope * (x < 0 ? -x : x) : half_pi * n.slope * x;
+    Lanes z = FAST_SIGMOID ? 1.0f + n.slope * (x < 0 ? -x : x) : half_pi * n.slope * x;
     return FAST_SIGMOID ? 1.0f / (z * z) : n.slope / 2 / (1.0f + z * z);
 }
 
-// Membranes u [T][WIDTH] of some channels of one row.
-template <bool ZERO, class Y>
-inline void membranes(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, long steps,
-                      long width, float* u) {
-    float before[WIDTH] = {}, fired[WIDTH] = {};  // at rest, below every threshold
-    for (long t = 0; t < steps; t++, y += y_step, u += WIDTH)
-        for (long i = 0; i < width; i++) {
-            float current = number(y[i]) * scale[i] + shift[i], b = before[i];
-            float now = ZERO ? (b - b * fired[i]) * n.beta + current : (b * n.beta + current) - fired[i] * n.threshold;
-            before[i] = u[i] = now;
-            fired[i] = now > n.threshold ? 1.0f : 0.0f;
-        }
+// visit(t, membranes, which of them fired) for T steps of WIDTH channels of one row, or fewer.
+template <bool ZERO, class Y, class F>
+inline void integrate(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, long steps,
+                      long width, F visit) {
+    Lanes u = {}, fired = {}, gain = load(scale, width), offset = load(shift, width);
+    for (long t = 0; t < steps; t++) {
+        Lanes current = load(y + t * y_step, width) * gain + offset;
+        u = ZERO ? (u - u * fired) * n.beta + current : (u * n.beta + current) - fired * n.threshold;
+        Flags above = u > n.threshold;
+        fired = (Lanes)((Flags)same(1.0f) & above);
+        visit(t, u, fired, above);
+    }
 }
 
 // run(first channel, number of them) over all channels; whole blocks have a constant width.
@@ -55,40 +54,34 @@ inline void blocks(long channels, F run) {
     if (c < channels) run(c, channels - c);
 }
 
-// A bit for each of `width` membranes that is above the threshold.
-inline uint32_t fired_bits(const float* u, float threshold, long width) {
+inline uint32_t bits_of(Flags above) {
 #ifdef __AVX512F__
-    if (width == WIDTH) {
-        __m512 limit = _mm512_set1_ps(threshold);
-        return uint32_t(_mm512_cmp_ps_mask(_mm512_loadu_ps(u), limit, _CMP_GT_OQ)) |
-               uint32_t(_mm512_cmp_ps_mask(_mm512_loadu_ps(u + 16), limit, _CMP_GT_OQ)) << 16;
-    }
-#endif
+    return _mm512_cmplt_epi32_mask((__m512i)above, _mm512_setzero_si512());
+#else
     uint32_t bits = 0;
-    for (long i = 0; i < width; i++) bits |= uint32_t(u[i] > threshold) << i;
+    for (long i = 0; i < WIDTH; i++) bits |= uint32_t(above[i] & 1) << i;
     return bits;
+#endif
 }
 
 template <bool ZERO, class Y, class S>
 void fire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, S* spikes, long steps,
           long rows, long channels, int threads) {
-    long words = (channels + WIDTH - 1) / WIDTH;
-#pragma omp parallel num_threads(threads)
-    {
-        std::vector<float> u(steps * WIDTH);
-#pragma omp for schedule(static)
-        for (long r = 0; r < rows; r++)
-            blocks(channels, [&](long c, long width) {
-                long at = r * channels + c;
-                membranes<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width, u.data());
-                for (long t = 0; t < steps; t++)
-                    if constexpr (std::is_same_v<S, uint32_t>)
-                        spikes[(t * rows + r) * words + c / WIDTH] = fired_bits(&u[t * WIDTH], n.threshold, width);
-                    else
-                        for (long i = 0; i < width; i++)
-                            put(spikes + t * rows * channels + at + i, u[t * WIDTH + i] > n.threshold ? 1.0f : 0.0f);
-            });
-    }
+    long words = (channels + 31) / 32;
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (long r = 0; r < rows; r++)
+        blocks(channels, [&](long c, long width) {
+            long at = r * channels + c;
+            integrate<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width,
+                            [&](long t, Lanes, Lanes fired, Flags above) {
+                                if constexpr (std::is_same_v<S, uint32_t>) {  // lanes beyond the width are no channels
+                                    uint32_t bits = bits_of(above) & ((1u << width) - 1);
+                                    uint32_t* word = spikes + (t * rows + r) * words + c / 32;
+                                    *word = c % 32 ? *word | bits << WIDTH : bits;
+                                } else
+                                    store(spikes + t * rows * channels + at, fired, width);
+                            });
+        });
 }
 
 // The currents' gradient [T or 1][R][C], its sum [C] over steps and rows, and that of its product with y - center.
@@ -99,37 +92,32 @@ void unfire(const Neuron& n, const Y* y, long y_step, const float* scale, const 
     std::vector<float> partial(PARTS * 2 * channels, 0.0f);
 #pragma omp parallel num_threads(threads)
     {
-        std::vector<float> u(steps * WIDTH);
+        std::vector<Lanes> membranes(steps), spikes(steps);
 #pragma omp for schedule(static)
         for (long part = 0; part < PARTS; part++)
             for (long r = rows * part / PARTS; r < rows * (part + 1) / PARTS; r++)
                 blocks(channels, [&](long c, long width) {
                     long at = r * channels + c;
                     float *sum = &partial[part * 2 * channels + c], *sum_y = sum + channels;
-                    float after[WIDTH] = {}, total[WIDTH] = {}, fired[WIDTH];
-                    membranes<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width, u.data());
+                    integrate<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width,
+                                    [&](long t, Lanes u, Lanes fired, Flags) { membranes[t] = u, spikes[t] = fired; });
+                    Lanes after = {}, total = {}, middle = load(center + c, width), product = load(sum_y, width);
                     for (long t = steps - 1; t >= 0; t--) {
-                        const float* now = u.data() + t * WIDTH;
-                        const G* g = grad_spikes + t * g_step + at;
-                        for (long i = 0; i < width; i++) fired[i] = now[i] > n.threshold ? 1.0f : 0.0f;
-                        for (long i = 0; i < width; i++) {
-                            float kept = ZERO ? after[i] - after[i] * fired[i] : after[i];
-                            float slope = surrogate<FAST_SIGMOID>(n, now[i] - n.threshold);
-                            after[i] = number(g[i]) * slope + kept * n.beta;
-                            total[i] += after[i];
-                        }
+                        Lanes kept = ZERO ? after - after * spikes[t] : after;
+                        Lanes slope = surrogate<FAST_SIGMOID>(n, membranes[t] - n.threshold);
+                        after = load(grad_spikes + t * g_step + at, width) * slope + kept * n.beta;
+                        total += after;
                         if (y_step != 0) {
-                            float* out = grad + t * rows * channels + at;
-                            for (long i = 0; i < width; i++) out[i] = after[i];
-                            for (long i = 0; i < width; i++)
-                                sum_y[i] += after[i] * (number(y[t * y_step + at + i]) - center[c + i]);
+                            store(grad + t * rows * channels + at, after, width);
+                            product += after * (load(y + t * y_step + at, width) - middle);
                         }
                     }
-                    for (long i = 0; i < width; i++) sum[i] += total[i];
                     if (y_step == 0) {
-                        for (long i = 0; i < width; i++) grad[at + i] = total[i];
-                        for (long i = 0; i < width; i++) sum_y[i] += total[i] * (number(y[at + i]) - center[c + i]);
+                        store(grad + at, total, width);
+                        product += total * (load(y + at, width) - middle);
                     }
+                    store(sum, load(sum, width) + total, width);
+                    store(sum_y, product, width);
                 });
     }
     for (long part = 0; part < PARTS; part++)

@@ -13,8 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from switchmt_snn.spiking.native import Neurons, Spikes, batch_moments, scaled_images
-from switchmt_snn.spiking.native_products import Features, Synapses, convolved, has_spike_products
+from switchmt_snn.spiking.native_products import Synapses, connected, convolved, spikes_as_bits
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
+
+_STREAMS = "streams"
+"""All streams have the same inputs, so their synapses are one layer."""
 
 
 class NativeNetwork:
@@ -28,7 +31,7 @@ class NativeNetwork:
         """Raises ValueError for a network that the native engine has no code for."""
         self._network = network
         self._dtype = torch.float32 if precision is None else precision
-        self._form = torch.int32 if has_spike_products() else self._dtype
+        self._form = torch.int32 if spikes_as_bits(self._dtype) else self._dtype
         """What spikes are kept as: bits, or numbers of the products' dtype."""
         self._neurons = Neurons(network.config)
         self._frozen: tuple[int, dict[str, Synapses]] | None = None
@@ -47,37 +50,36 @@ class NativeNetwork:
         version = sum(parameter._version for parameter in self._network.parameters())
         if self._frozen is not None and self._frozen[0] == version:
             return self._frozen[1]
-        layers = {**self._network.trunk, **self._network.streams}
-        synapses = {name: self._rounded(cast(TrunkLayer | Stream, layer)) for name, layer in layers.items()}
-        if not any(parameter.requires_grad for parameter in self._network.parameters()):
+        network = self._network
+        owners = {name: [layer] for name, layer in network.trunk.items()} | {_STREAMS: [*network.streams.values()]}
+        synapses = {name: Synapses.of(_layers(parts), self._dtype) for name, parts in owners.items()}
+        if not any(parameter.requires_grad for parameter in network.parameters()):
             self._frozen = version, synapses
         return synapses
-
-    def _rounded(self, owner: TrunkLayer | Stream) -> Synapses:
-        layer = owner.synapses[-1] if isinstance(owner.synapses, nn.Sequential) else owner.synapses
-        return Synapses.of(cast(nn.Linear | nn.Conv2d, layer), self._dtype)
 
     def decide(self, x: Tensor, context: Context, synapses: dict[str, Synapses], training: bool) -> Tensor:
         """Q-values ``[B, A]`` of :meth:`inputs` in a task's context; normalisation as ``training`` says."""
         network, spikes = self._network, Spikes(x)
         for name, layer in network.trunk.items():
             spikes = self._trunk_layer(cast(TrunkLayer, layer), spikes, context[name], synapses[name], training)
-        features = Features(spikes)
-        outputs = {}
-        for name, stream in network.streams.items():
-            y_TBN = features.connected(synapses[name])
+        y_TBN = connected(spikes, synapses[_STREAMS])
+        sizes = [bias.shape[0] for bias in synapses[_STREAMS].parameters[1::2]]
+        gains = []
+        for (name, stream), size in zip(network.streams.items(), sizes, strict=True):
             dendrites = cast(Stream, stream).dendrites
-            gain_N = None if dendrites is None else dendrites.gains(*context[name]).expand(y_TBN.shape[-1])
-            spikes_TBN = self._neurons.gated(y_TBN, gain_N, torch.float32).numbers
-            outputs[name] = network.read_out(cast(Stream, stream), spikes_TBN)
-        return network.combine(outputs)
+            gains.append(torch.ones(size) if dendrites is None else dendrites.gains(*context[name]).expand(size))
+        spikes_TBN = self._neurons.gated(y_TBN, torch.cat(gains), torch.float32).numbers
+        if network.config.readout == "mean":
+            spikes_TBN = spikes_TBN.mean(0, keepdim=True)
+        parts = zip(network.streams.items(), spikes_TBN.split(sizes, dim=-1), strict=True)
+        return network.combine({name: network.read_out(cast(Stream, stream), part) for (name, stream), part in parts})
 
     def _trunk_layer(
         self, layer: TrunkLayer, x: Spikes, context: tuple[Tensor, ...], synapses: Synapses, training: bool
     ) -> Spikes:
         """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``, as the next layer reads them."""
         if layer.normalization is None:
-            y_SBN = Features(x).connected(synapses)
+            y_SBN = connected(x, synapses)
             return self._neurons.gated(y_SBN, None, self._form)
         y = convolved(x, synapses)
         y_SRC = y.flatten(1, -2)
@@ -95,3 +97,9 @@ class NativeNetwork:
             dtype=self._form,
         )
         return spikes.with_rows(y.shape[1:-1])
+
+
+def _layers(owners: list[nn.Module]) -> list[nn.Linear | nn.Conv2d]:
+    """The modules that have the synapses."""
+    synapses = (cast(TrunkLayer | Stream, owner).synapses for owner in owners)
+    return [cast(nn.Linear | nn.Conv2d, part[-1] if isinstance(part, nn.Sequential) else part) for part in synapses]

@@ -1,4 +1,4 @@
-// float and bfloat16 numbers.
+// float and bfloat16 numbers, one and sixteen at a time.
 
 #pragma once
 
@@ -25,4 +25,47 @@ inline void put(BFloat16* place, float x) {  // to the nearest, ties to even; no
     std::memcpy(&bits, &x, 4);
     uint32_t rounded = (bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16;
     place->bits = uint16_t(x != x ? 0x7fc0u : rounded);
+}
+
+constexpr long WIDTH = 16;
+typedef float Lanes __attribute__((vector_size(4 * WIDTH)));
+typedef int32_t Flags __attribute__((vector_size(4 * WIDTH)));  // all bits of a lane, or none
+typedef uint32_t Words __attribute__((vector_size(4 * WIDTH)));
+typedef uint16_t Halves __attribute__((vector_size(2 * WIDTH)));
+
+inline Lanes same(float x) { return Lanes{} + x; }
+
+// Of fewer than WIDTH numbers, the other lanes are 0 when they are read, and not written.
+inline Lanes load(const float* place, long width) {
+    Lanes x = {};
+    if (width == WIDTH)
+        std::memcpy(&x, place, sizeof x);
+    else
+        std::memcpy(&x, place, width * sizeof *place);
+    return x;
+}
+
+inline Lanes load(const BFloat16* place, long width) {
+    Halves x = {};
+    if (width == WIDTH)
+        std::memcpy(&x, place, sizeof x);
+    else
+        std::memcpy(&x, place, width * sizeof *place);
+    return (Lanes)(__builtin_convertvector(x, Words) << 16);
+}
+
+inline void store(float* place, Lanes x, long width) {
+    if (width == WIDTH)
+        std::memcpy(place, &x, sizeof x);
+    else
+        std::memcpy(place, &x, width * sizeof *place);
+}
+
+inline void store(BFloat16* place, Lanes x, long width) {  // as put()
+    Words bits = (Words)x, rounded = (bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16;
+    Halves halves = __builtin_convertvector(x != x ? Words{} + 0x7fc0u : rounded, Halves);
+    if (width == WIDTH)
+        std::memcpy(place, &halves, sizeof halves);
+    else
+        std::memcpy(place, &halves, width * sizeof *place);
 }

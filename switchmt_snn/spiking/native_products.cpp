@@ -53,8 +53,8 @@ void make_tables(const float* a, long bits, float* tables) {
         }
 }
 
-// sums [ROWS][LANES] += tables . bits of one panel.
-void add_panel(const float* tables, const uint32_t* panel, long words, float* sums) {
+// sums [ROWS][LANES] = tables . bits of one panel, or more by that.
+void add_panel(const float* tables, const uint32_t* panel, long words, float* sums, bool more) {
     constexpr long VECTORS = LANES / 16;
     __m512 one = ones(), total[ROWS][VECTORS];
     for (long m = 0; m < ROWS; m++)
@@ -78,7 +78,7 @@ void add_panel(const float* tables, const uint32_t* panel, long words, float* su
     for (long m = 0; m < ROWS; m++)
         for (long v = 0; v < VECTORS; v++) {
             float* place = sums + m * LANES + v * 16;
-            _mm512_store_ps(place, _mm512_add_ps(_mm512_load_ps(place), total[m][v]));
+            _mm512_store_ps(place, more ? _mm512_add_ps(_mm512_load_ps(place), total[m][v]) : total[m][v]);
         }
 }
 
@@ -134,7 +134,6 @@ void multiply(const A* a, B* bias, const uint32_t* panels, C* out, long M, long 
             long super = task / blocks, m = task % blocks * ROWS, here = std::min(ROWS, M - m);
             long first = all * super / supers, count = all * (super + 1) / supers - first;
             double whole[ROWS] = {};
-            std::fill(sums, sums + count * ROWS * LANES, 0.0f);
             for (long k = 0; k < words * 32; k += CHUNK) {
                 long bits = std::min(CHUNK, words * 32 - k), real = std::min(bits, K - k);
                 for (long r = 0; r < ROWS; r++)
@@ -148,7 +147,7 @@ void multiply(const A* a, B* bias, const uint32_t* panels, C* out, long M, long 
                 make_tables(some, bits, tables);
                 for (long p = 0; p < count; p++)
                     add_panel(tables, panels + ((first + p) * words + k / 32) * LANES, bits / 32,
-                              sums + p * ROWS * LANES);
+                              sums + p * ROWS * LANES, k > 0);
             }
             if constexpr (!LANES_FIRST)
                 if (super == 0) std::copy(whole, whole + here, bias + m);

@@ -7,6 +7,7 @@ Shapes: T steps, B batch, I = T * B images, H, W places, C channels in, O channe
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -19,36 +20,44 @@ from switchmt_snn.spiking.native_library import library, typed
 _LANES = 64
 
 
-def has_spike_products() -> bool:
-    """Whether this machine's processor has the instructions for products of bits."""
-    return bool(library().snn_has_products())
+def spikes_as_bits(dtype: torch.dtype) -> bool:
+    """Whether products of spikes in a dtype are those of bits here: the processor needs AVX-512. bfloat16 is left to
+    multiplications where they have their own unit (AMX), which by its peak is faster; that was not measured."""
+    has_amx = bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
+    return bool(library().snn_has_products()) and not (dtype == torch.bfloat16 and has_amx)
 
 
 class Synapses(NamedTuple):
-    """A layer's synapses: its parameters, and what they are in the products' dtype, channels innermost."""
+    """Synapses of a layer, or of several fully connected layers with the same inputs, one after the other."""
 
-    layer: nn.Linear | nn.Conv2d
+    parameters: tuple[Tensor, ...]
+    """Weight and bias of each layer, which get the gradients."""
     weight: Tensor
+    """In the products' dtype, channels innermost."""
     bias: Tensor
     matrix: Tensor
     """The weights ``[O, bits]`` for products of bits, a convolution's filled up to whole words of channels."""
+    stride: int
 
     @classmethod
-    def of(cls, layer: nn.Linear | nn.Conv2d, dtype: torch.dtype) -> Synapses:
+    @torch.no_grad()
+    def of(cls, layers: Sequence[nn.Linear | nn.Conv2d], dtype: torch.dtype) -> Synapses:
         """As the parameters are now."""
-        with torch.no_grad():
-            weight = matrix = channels_last(layer.weight.to(dtype))
-            if weight.dim() == 4:
-                matrix = weight.permute(0, 2, 3, 1)
-                if missing := -weight.shape[1] % 32:
-                    matrix = F.pad(matrix, (0, missing))
-                matrix = matrix.flatten(1)
-            return cls(layer, weight, cast(Tensor, layer.bias).to(dtype), matrix)
-
-    @property
-    def stride(self) -> int:
-        """Of a convolution, both ways."""
-        return cast(nn.Conv2d, self.layer).stride[0]
+        parameters = tuple(cast(Tensor, part) for layer in layers for part in (layer.weight, layer.bias))
+        weights, biases = parameters[::2], parameters[1::2]
+        if isinstance(layers[0], nn.Conv2d):
+            weight = channels_last(weights[0].to(dtype))
+            missing = -weight.shape[1] % 32
+            matrix = weight.permute(0, 2, 3, 1)
+            matrix = (F.pad(matrix, (0, missing)) if missing else matrix).flatten(1)
+            return cls(parameters, weight, biases[0].detach(), matrix, layers[0].stride[0])
+        if len(layers) == 1:
+            weight = weights[0].detach().to(dtype)
+        else:
+            weight = torch.empty(sum(part.shape[0] for part in weights), weights[0].shape[1], dtype=dtype)
+            for rows, part in zip(weight.split([part.shape[0] for part in weights]), weights, strict=True):
+                rows.copy_(part)
+        return cls(parameters, weight, torch.cat(biases), weight, 0)
 
 
 class Panels(NamedTuple):
@@ -109,7 +118,7 @@ class Panels(NamedTuple):
         if not fitting or bias_O.dtype != torch.float32 or not contiguous:
             raise ValueError(
                 f"weights {tuple(weight_OK.shape)} with strides {weight_OK.stride()} and bias {bias_O.dtype} "
-                f"{tuple(bias_O.shape)}, expected, both contiguous, weights for {self.bits} inputs and as many float32 biases"
+                f"{tuple(bias_O.shape)}, expected contiguous weights for {self.bits} inputs and as many float32 biases"
             )
         y = torch.empty(self.lanes, outputs, dtype=weight_OK.dtype)
         sizes = (outputs, self.bits, self.lanes, torch.get_num_threads())
@@ -137,40 +146,27 @@ class Panels(NamedTuple):
 
 def convolved(x: Spikes, synapses: Synapses) -> Tensor:
     """A convolution's products ``[T, B, h, w, O]``, contiguous, for ``[T, B, H, W, C]``."""
-    weight, bias, stride = synapses.layer.weight, synapses.layer.bias, synapses.stride
-    steps, (height, width) = x.numbers.shape[:2], x.numbers.shape[2:4]
+    steps, sides = x.numbers.shape[:2], x.numbers.shape[2:4]
+    kernel, stride = synapses.weight.shape[-1], synapses.stride
     numbers_ICHW = x.numbers.flatten(0, 1).permute(0, 3, 1, 2)
     if x.bits is None:
-        what = (numbers_ICHW, weight, bias, synapses.weight, synapses.bias, stride)
-        y = _Convolution.apply(*what)  # type: ignore[no-untyped-call]
+        y = _Convolution.apply(numbers_ICHW, synapses, *synapses.parameters)  # type: ignore[no-untyped-call]
         return y.permute(0, 2, 3, 1).unflatten(0, steps)  # type: ignore[no-any-return]
-    panels = Panels.of_windows(x.bits.flatten(0, 1), weight.shape[-1], stride)
-    of_bits = (numbers_ICHW, weight, bias, synapses, panels, stride)
-    y = _SpikeConvolution.apply(*of_bits)  # type: ignore[no-untyped-call]
-    sides = (_outputs(side, weight.shape[-1], stride) for side in (height, width))
-    return y.view(*steps, *sides, -1)  # type: ignore[no-any-return]
+    panels = Panels.of_windows(x.bits.flatten(0, 1), kernel, stride)
+    y = _SpikeConvolution.apply(numbers_ICHW, synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
+    return y.view(*steps, *(_outputs(side, kernel, stride) for side in sides), -1)  # type: ignore[no-any-return]
 
 
-class Features:
-    """A layer's output as inputs ``[T, B, K]`` of fully connected layers: images ``[T, B, H, W, C]`` in the order
-    ``[C, H, W]``, or what already is ``[T, B, K]``."""
-
-    def __init__(self, x: Spikes) -> None:
-        self._steps = x.numbers.shape[:2]
-        self._numbers = x.numbers.flatten(0, 1).movedim(-1, 1).flatten(1)
-        channels = x.numbers.shape[-1]
-        self._panels = None if x.bits is None else Panels.of_images(x.bits.flatten(0, 1), channels)
-
-    def connected(self, synapses: Synapses) -> Tensor:
-        """A layer's products ``[T, B, O]``."""
-        weight, bias = synapses.layer.weight, synapses.layer.bias
-        if self._panels is None:
-            what = (self._numbers, weight, bias, synapses.weight, synapses.bias)
-            y = _Linear.apply(*what)  # type: ignore[no-untyped-call]
-        else:
-            of_bits = (self._numbers, weight, bias, synapses, self._panels)
-            y = _SpikeLinear.apply(*of_bits)  # type: ignore[no-untyped-call]
-        return y.unflatten(0, self._steps)  # type: ignore[no-any-return]
+def connected(x: Spikes, synapses: Synapses) -> Tensor:
+    """Products ``[T, B, O]`` of fully connected layers for ``[T, B, K]``, or for images ``[T, B, H, W, C]`` that are
+    flattened in the order ``[C, H, W]``."""
+    numbers_IK = x.numbers.flatten(0, 1).movedim(-1, 1).flatten(1)
+    if x.bits is None:
+        y = _Linear.apply(numbers_IK, synapses, *synapses.parameters)  # type: ignore[no-untyped-call]
+    else:
+        panels = Panels.of_images(x.bits.flatten(0, 1), x.numbers.shape[-1])
+        y = _SpikeLinear.apply(numbers_IK, synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
+    return y.unflatten(0, x.numbers.shape[:2])  # type: ignore[no-any-return]
 
 
 def channels_last(x: Tensor) -> Tensor:
@@ -189,28 +185,25 @@ def _outputs(side: int, kernel: int, stride: int) -> int:
     return (side - kernel) // stride + 1
 
 
-# All of them take a layer's parameters, which get the gradients, and what was made of the parameters, which is read.
+# All of them take the layers' parameters last: they get the gradients, and what was made of them is read.
 
 
 class _SpikeConvolution(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, numbers: Tensor, _: Tensor, bias: Tensor, synapses: Synapses, panels: Panels, stride: int
-    ) -> Tensor:
-        ctx.save_for_backward(synapses.weight)
-        ctx.panels, ctx.stride, ctx.sides = panels, stride, numbers.shape[2:]
-        return panels.times(synapses.matrix, bias.detach())
+    def forward(ctx: Any, numbers: Tensor, synapses: Synapses, panels: Panels, *parameters: Tensor) -> Tensor:
+        ctx.synapses, ctx.panels, ctx.sides = synapses, panels, numbers.shape[2:]
+        return panels.times(synapses.matrix, synapses.bias)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (weight,), grad_y = ctx.saved_tensors, gradients[0].contiguous()
+        grad_y, weight, stride = gradients[0].contiguous(), ctx.synapses.weight, ctx.synapses.stride
         out_channels, channels, kernel, _ = weight.shape
-        outputs = [_outputs(side, kernel, ctx.stride) for side in ctx.sides]
+        outputs = [_outputs(side, kernel, stride) for side in ctx.sides]
         grad_y_IOhw = grad_y.view(-1, *outputs, out_channels).permute(0, 3, 1, 2)
-        grad_x = _input_gradient(grad_y_IOhw, weight, ctx.stride, ctx.sides)
+        grad_x = _input_gradient(grad_y_IOhw, weight, stride, ctx.sides)
         grad_weight, grad_bias = ctx.panels.gradients(grad_y)
         grad_OkkC = grad_weight.view(out_channels, kernel, kernel, -1)[..., :channels]
-        return grad_x, grad_OkkC.permute(0, 3, 1, 2), grad_bias, None, None, None
+        return grad_x, None, None, grad_OkkC.permute(0, 3, 1, 2), grad_bias
 
 
 def _input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: tuple[int, int]) -> Tensor:
@@ -230,49 +223,56 @@ def _input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: tuple[in
 
 class _SpikeLinear(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, numbers: Tensor, _: Tensor, bias: Tensor, synapses: Synapses, panels: Panels) -> Tensor:
-        ctx.save_for_backward(synapses.weight)
-        ctx.panels = panels
-        return panels.times(synapses.matrix, bias.detach())
+    def forward(ctx: Any, numbers: Tensor, synapses: Synapses, panels: Panels, *parameters: Tensor) -> Tensor:
+        ctx.synapses, ctx.panels = synapses, panels
+        return panels.times(synapses.matrix, synapses.bias)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (weight,), grad_y = ctx.saved_tensors, gradients[0].contiguous()
-        return grad_y @ weight, *ctx.panels.gradients(grad_y), None, None
+        grad_y = gradients[0].contiguous()
+        return grad_y @ ctx.synapses.weight, None, None, *_by_layer(ctx.synapses, *ctx.panels.gradients(grad_y))
+
+
+def _by_layer(synapses: Synapses, grad_weight: Tensor, grad_bias: Tensor) -> list[Tensor]:
+    """Gradients in the order of the parameters."""
+    sizes = [bias.shape[0] for bias in synapses.parameters[1::2]]
+    pairs = zip(grad_weight.split(sizes), grad_bias.split(sizes), strict=True)
+    return [gradient for pair in pairs for gradient in pair]
 
 
 class _Convolution(torch.autograd.Function):
     """Its two gradients are asked for one by one: together, oneDNN takes up to 1.4 times as long."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, _: Tensor, __: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        ctx.stride = stride
-        return channels_last(F.conv2d(x, weight, bias, stride))
+    def forward(ctx: Any, x: Tensor, synapses: Synapses, *parameters: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.synapses = synapses
+        return channels_last(F.conv2d(x, synapses.weight, synapses.bias.to(x.dtype), synapses.stride))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight = ctx.saved_tensors
-        grad_y = channels_last(gradients[0])
+        (x,), grad_y = ctx.saved_tensors, channels_last(gradients[0])
+        weight, stride = ctx.synapses.weight, ctx.synapses.stride
 
         def gradient(of_x: bool, of_weight: bool) -> tuple[Tensor, ...]:
-            sizes = ([weight.shape[0]], [ctx.stride] * 2, [0, 0], [1, 1], False, [0, 0], 1)
+            sizes = ([weight.shape[0]], [stride] * 2, [0, 0], [1, 1], False, [0, 0], 1)
             mask = [of_x, of_weight, of_weight]
             return torch.ops.aten.convolution_backward(grad_y, x, weight, *sizes, mask)  # type: ignore[no-any-return]
 
         grad_x = gradient(True, False)[0] if ctx.needs_input_grad[0] else None
-        grads = (grad.to(torch.float32) for grad in gradient(False, True)[1:])
-        return grad_x, *grads, None, None, None
+        return grad_x, None, *(grad.to(torch.float32) for grad in gradient(False, True)[1:])
 
 
 class _Linear(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, _: Tensor, __: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        return F.linear(x, weight, bias)
+    def forward(ctx: Any, x: Tensor, synapses: Synapses, *parameters: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.synapses = synapses
+        return F.linear(x, synapses.weight, synapses.bias.to(x.dtype))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (x, weight), (grad_y,) = ctx.saved_tensors, gradients
-        grad_x = grad_y @ weight if ctx.needs_input_grad[0] else None
-        return grad_x, (grad_y.T @ x).to(torch.float32), grad_y.sum(0, dtype=torch.float32), None, None
+        (x,), (grad_y,) = ctx.saved_tensors, gradients
+        grad_x = grad_y @ ctx.synapses.weight if ctx.needs_input_grad[0] else None
+        both = (grad_y.T @ x).to(torch.float32), grad_y.sum(0, dtype=torch.float32)
+        return grad_x, None, *_by_layer(ctx.synapses, *both)
