@@ -4,7 +4,8 @@
 [--hand-memory-back] [--json]``. All variants have the same layers and the same random batch. SpikingJelly takes part
 where it is installed (extra ``simulators``); on a GPU it chooses its kernels itself. There, batches lie on the device,
 ours runs as a CUDA graph, too, and every variant's peak of memory is given. One that fails is told with its reason and
-left out.
+left out. In every round a variant makes three steps in a row, as in training, and the first, beside what the variant
+before it left in caches and threads, is not timed.
 
 The physical limit of a variant is the time of its products alone (forward for Q*, Q and training, backward for weights
 and inputs; the first layer once for all T) at the speed of a large matrix product of its precision on this machine.
@@ -170,7 +171,7 @@ def measure(batch_size: int, timesteps: int, repeats: int, device: str, only: li
         except Exception as error:
             failed[name] = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
             del steps[name]
-    times = interleaved_ms(steps, repeats, warmup=4)
+    times = interleaved_ms(steps, repeats, warmup=4, calls=2)
     slowest = statistics.median(times[PLAIN])
     rows = {
         name: {
@@ -205,7 +206,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--batch", type=int, default=32, help="transitions of an update")
     parser.add_argument("--timesteps", type=int, default=4, help="simulation steps T")
-    parser.add_argument("--repeats", type=int, default=15, help="rounds in which every variant takes its turn")
+    parser.add_argument("--repeats", type=int, default=15, help="rounds in which every variant has two timed steps")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where all variants run")
     parser.add_argument("--only", nargs="*", default=[], metavar="TEXT", help="variants with such a text in their name")
     parser.add_argument("--hand-memory-back", action="store_true", help="leave the C library's memory settings alone")

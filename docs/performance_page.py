@@ -65,7 +65,7 @@ def update_part(update: dict[str, Any]) -> list[str]:
         "",
         "`python -m benchmarks.update_step`: one double-DQN step (two forwards, one forward and backward, Adam), batch",
         f"{update['batch']}, T = {update['timesteps']}, the dueling 84x84 network with dendrites, {update['repeats']} "
-        "rounds. `bfloat16` is",
+        "rounds of two timed steps. `bfloat16` is",
         "`learning.precision` (synaptic products only; spikes are exact), `native` and `compiled` are",
         "`learning.engine`: spikes and neurons in C++ (spiking networks only), and torch.compile. Limit: the products",
         "alone at the speed of a large matrix product of that precision on this machine; native updates keep spikes as",

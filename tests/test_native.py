@@ -61,7 +61,7 @@ def test_spikes_are_bitwise_those_of_the_eager_neurons(form, timesteps, shared, 
     weights, results = torch.randn(timesteps, rows, channels), []
     for run in (Neurons(config).gated, None):
         y_SRC, gain_C = y.clone().requires_grad_(), torch.linspace(0.3, 1.2, channels).requires_grad_()
-        spikes = plain_gated(config, y_SRC, gain_C) if run is None else run(y_SRC, gain_C, torch.float32).numbers
+        spikes = plain_gated(config, y_SRC, gain_C) if run is None else run(y_SRC, gain_C, "floats").numbers
         (spikes * weights).sum().backward()
         results.append((spikes, y_SRC.grad, gain_C.grad))
     (ours, *our_grads), (theirs, *their_grads) = results
@@ -71,6 +71,30 @@ def test_spikes_are_bitwise_those_of_the_eager_neurons(form, timesteps, shared, 
         torch.testing.assert_close(
             our_grad, their_grad, rtol=1e-2 if low else 1e-4, atol=scale * (5e-3 if low else 1e-5)
         )
+
+
+@builds
+@pytest.mark.parametrize("channels", [5, 16, 32, 47, 80])
+def test_every_form_has_the_same_spikes(channels: int) -> None:
+    """Numbers, floats, bits (no bit beyond the channels), mean; and the mean's gradient."""
+    neurons = Neurons(NetworkConfig(timesteps=3))
+    y, ones, g = (torch.randn(3, 21, channels) * 2).bfloat16(), torch.ones(channels), torch.randn(1, 21, channels)
+    floats = neurons.gated(y, ones, "floats").numbers
+    assert 0.1 < floats.mean() < 0.9
+    assert torch.equal(neurons.gated(y, ones, "numbers").numbers, floats.bfloat16())
+    spikes = neurons.gated(y, ones, "bits")
+    assert spikes.bits is not None
+    unpacked = (spikes.bits[..., None] >> torch.arange(32)) & 1
+    assert torch.equal(unpacked.flatten(2), F.pad(floats, (0, -channels % 32)).int())
+    grads = []
+    for form in ("mean", "floats"):
+        y_SRC = y.clone().requires_grad_()
+        numbers = neurons.gated(y_SRC, ones, form).numbers  # type: ignore[arg-type]
+        mean = numbers.mean(0, keepdim=True)
+        (mean * g).sum().backward()
+        grads.append((mean, y_SRC.grad))
+    assert torch.equal(grads[0][0], grads[1][0])
+    assert torch.equal(grads[0][1], grads[1][1])
 
 
 @builds
@@ -88,7 +112,7 @@ def test_normalized_spikes_equal_batch_norm_and_neurons(dtype: torch.dtype, step
         if is_native:
             mean_C, var_C = batch_moments(y_SRC.detach())
             of = (y_SRC, weight_C, bias_C, (mean_C, var_C), 1e-5)
-            spikes = Neurons(config).normalized(*of, of_batch=True, dtype=dtype).numbers
+            spikes = Neurons(config).normalized(*of, of_batch=True, form="numbers").numbers
         else:
             flat = y_SRC.flatten(0, 1).to(torch.float64)
             current = F.batch_norm(flat, None, None, weight_C.double(), bias_C.double(), True, 0.1, 1e-5)
@@ -125,18 +149,17 @@ def test_scaled_images_are_bitwise_those_of_torch(shape: tuple[int, ...], dtype:
 @builds
 def test_what_cplusplus_would_read_wrongly_is_refused() -> None:
     neurons, ones = Neurons(NetworkConfig(timesteps=4)), torch.ones(8)
-    for y, dtype in (
-        (torch.zeros(4, 8, 5).transpose(1, 2), torch.float32),
-        (torch.zeros(3, 5, 8), torch.float32),
-        (torch.zeros(4, 5, 8), torch.bfloat16),
-        (torch.zeros(4, 5, 8, dtype=torch.float64), torch.float32),
-        (torch.zeros(4, 5, 8, device="meta"), torch.float32),
+    for y in (
+        torch.zeros(4, 8, 5).transpose(1, 2),
+        torch.zeros(3, 5, 8),
+        torch.zeros(4, 5, 8, dtype=torch.float64),
+        torch.zeros(4, 5, 8, device="meta"),
     ):
         with pytest.raises(ValueError, match="expected"):
-            neurons.gated(y, ones, dtype)
+            neurons.gated(y, ones, "floats")
     for gain_C in (ones.double(), torch.ones(1)):
         with pytest.raises(ValueError, match="expected float32 for 8 channels"):
-            neurons.gated(torch.zeros(4, 5, 8), gain_C, torch.float32)
+            neurons.gated(torch.zeros(4, 5, 8), gain_C, "floats")
 
 
 @builds
@@ -148,7 +171,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
         for number in (1, 2, 3):
             torch.set_num_threads(number)
             y_SRC, gain_C = y.clone().requires_grad_(), torch.ones(48, requires_grad=True)
-            (Neurons(config).gated(y_SRC, gain_C, torch.float32).numbers * g).sum().backward()
+            (Neurons(config).gated(y_SRC, gain_C, "floats").numbers * g).sum().backward()
             results.append((y_SRC.grad, gain_C.grad, *batch_moments(y)))
     finally:
         torch.set_num_threads(threads)

@@ -10,6 +10,7 @@ import torch
 from switchmt_snn.config import METHOD_TRAITS, Engine, ExperimentConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking import native, native_library
+from switchmt_snn.spiking.native_products import spikes_as_bits
 
 COMPILE_FROM_UPDATES = 150_000
 """``engine=auto`` compiles runs of at least this many updates: half a minute at the start, minutes to hours back."""
@@ -174,7 +175,10 @@ def compile_problem() -> str | None:
 
 def built_engines() -> dict[str, str]:
     """What of the engines that need a C++ compiler works here, and what goes wrong with the others."""
-    return {"torch_compile": compile_problem() or "works", "native_engine": native_library.problem() or "works"}
+    native_engine = native_library.problem()
+    if native_engine is None:
+        native_engine = "works" if spikes_as_bits(torch.float32) else "works, without products of bits (no AVX-512)"
+    return {"torch_compile": compile_problem() or "works", "native_engine": native_engine}
 
 
 def keep_freed_memory() -> bool:

@@ -84,6 +84,21 @@ void fire(const Neuron& n, const Y* y, long y_step, const float* scale, const fl
         });
 }
 
+// Each neuron's mean spikes over the steps [R][C].
+template <bool ZERO, class Y>
+void fire_mean(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, float* mean, long steps,
+               long rows, long channels, int threads) {
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (long r = 0; r < rows; r++)
+        blocks(channels, [&](long c, long width) {
+            long at = r * channels + c;
+            Lanes count = {};
+            integrate<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width,
+                            [&](long, Lanes, Lanes fired, Flags) { count += fired; });
+            store(mean + at, count / float(steps), width);
+        });
+}
+
 // The currents' gradient [T or 1][R][C], its sum [C] over steps and rows, and that of its product with y - center.
 template <bool ZERO, bool FAST_SIGMOID, class Y, class G>
 void unfire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, const float* center,
@@ -214,6 +229,17 @@ void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const
         with_type(y_low, [&](auto y_) {
             fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (uint32_t*)words, steps,
                              rows, channels, threads);
+        });
+    });
+}
+
+// Their mean over the steps, floats [R][C].
+void snn_fire_mean(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, float* mean,
+                   long steps, long rows, long channels, int threads) {
+    with_flag(n->zero, [&](auto zero) {
+        with_type(y_low, [&](auto y_) {
+            fire_mean<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, mean, steps, rows,
+                                  channels, threads);
         });
     });
 }

@@ -7,7 +7,7 @@ Shapes: S steps of the currents (T, or 1 that all steps share), T steps of the s
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +15,10 @@ from torch import Tensor
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.spiking.native_library import library, typed
 from switchmt_snn.spiking.neurons import DEFAULT_SLOPE
+
+Form = Literal["numbers", "floats", "bits", "mean"]
+"""Of spikes ``[T, R, C]``: numbers of the currents' dtype, or float32; int32 words ``[T, R, words]``, channel c being
+bit c % 32 of word c // 32; their mean over the steps ``[1, R, C]``, float32."""
 
 _SURROGATES = ("atan", "fast_sigmoid")
 """Those that ``native.cpp`` has."""
@@ -77,10 +81,10 @@ class Neurons:
         self._neuron = _Neuron(beta, config.threshold, slope, config.reset == "zero", fast_sigmoid)
         self.timesteps = config.timesteps
 
-    def gated(self, y_SRC: Tensor, gain_C: Tensor | None, dtype: torch.dtype) -> Spikes:
-        """Spikes for currents ``y * gain`` (None: 1); ``dtype`` as for :meth:`fire`."""
+    def gated(self, y_SRC: Tensor, gain_C: Tensor | None, form: Form) -> Spikes:
+        """Spikes for currents ``y * gain`` (None: 1)."""
         gain_C = torch.ones(y_SRC.shape[-1]) if gain_C is None else gain_C.contiguous()
-        return self._spikes(y_SRC, gain_C, None, _currents(y_SRC, gain_C), dtype)
+        return self._spikes(y_SRC, gain_C, None, _currents(y_SRC, gain_C), form)
 
     def normalized(
         self,
@@ -90,52 +94,54 @@ class Neurons:
         moments: tuple[Tensor, Tensor],
         epsilon: float,
         of_batch: bool,
-        dtype: torch.dtype,
+        form: Form,
     ) -> Spikes:
-        """Spikes for currents ``(y - mean) / sqrt(variance + epsilon) * weight + bias``; ``dtype`` as for :meth:`fire`.
+        """Spikes for currents ``(y - mean) / sqrt(variance + epsilon) * weight + bias``.
 
         ``of_batch``: the moments (mean and variance) are those of ``y``, and the gradient goes through them; else
         there is no gradient.
         """
         currents_4C = _currents(y_SRC, weight_C, bias_C, moments, epsilon)
         if of_batch:
-            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, dtype)
+            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, form)
         with torch.no_grad():
-            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, dtype)
+            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, form)
 
-    def _spikes(
-        self, y_SRC: Tensor, a_C: Tensor, b_C: Tensor | None, currents_4C: Tensor, dtype: torch.dtype
-    ) -> Spikes:
+    def _spikes(self, y_SRC: Tensor, a_C: Tensor, b_C: Tensor | None, currents_4C: Tensor, form: Form) -> Spikes:
         if torch.is_grad_enabled():
-            return Spikes(*_Spikes.apply(y_SRC, a_C, b_C, self, currents_4C, dtype))  # type: ignore[no-untyped-call]
-        return self._fired(y_SRC, currents_4C, dtype)
+            return Spikes(*_Spikes.apply(y_SRC, a_C, b_C, self, currents_4C, form))  # type: ignore[no-untyped-call]
+        return self._fired(y_SRC, currents_4C, form)
 
-    def _fired(self, y_SRC: Tensor, currents_4C: Tensor, dtype: torch.dtype) -> Spikes:
-        spikes = self.fire(y_SRC, currents_4C, dtype)
-        if dtype != torch.int32:
+    def _fired(self, y_SRC: Tensor, currents_4C: Tensor, form: Form) -> Spikes:
+        spikes = self.fire(y_SRC, currents_4C, form)
+        if form != "bits":
             return Spikes(spikes)
         return Spikes(_NOTHING[y_SRC.dtype].expand(self.timesteps, *y_SRC.shape[1:]), spikes)
 
-    def fire(self, y_SRC: Tensor, currents_4C: Tensor, dtype: torch.dtype) -> Tensor:
-        """Spikes ``[T, R, C]``, without gradient; as bits if ``dtype`` is int32: ``[T, R, words]``, channel c being bit
-        c % 32 of word c // 32. The first two rows of ``currents`` are scale and shift.
+    def fire(self, y_SRC: Tensor, currents_4C: Tensor, form: Form) -> Tensor:
+        """Spikes without gradient; the first two rows of ``currents`` are scale and shift.
 
         Raises:
-            ValueError: ``y`` is not contiguous, has neither 1 nor T steps, or a dtype that does not go with ``dtype``.
+            ValueError: ``y`` is not contiguous float32 or bfloat16 of 1 or T steps.
         """
         steps, rows, channels = y_SRC.shape
-        fitting = dtype in (torch.float32, torch.int32, y_SRC.dtype)
-        if not y_SRC.is_contiguous() or steps not in (1, self.timesteps) or not fitting:
+        if not y_SRC.is_contiguous() or steps not in (1, self.timesteps):
             raise ValueError(
-                f"{y_SRC.dtype} {tuple(y_SRC.shape)} with strides {y_SRC.stride()} for spikes in {dtype}, expected "
-                f"contiguous currents of 1 or {self.timesteps} steps, and spikes in float32 or the currents' dtype"
+                f"{y_SRC.dtype} {tuple(y_SRC.shape)} with strides {y_SRC.stride()}, expected contiguous currents of 1 "
+                f"or {self.timesteps} steps"
             )
-        as_bits = dtype == torch.int32
-        spikes = torch.empty(self.timesteps, rows, -(-channels // 32) if as_bits else channels, dtype=dtype)
-        where = (spikes.data_ptr(),) if as_bits else typed(spikes)
-        fire = library().snn_fire_bits if as_bits else library().snn_fire
+        what = (ctypes.addressof(self._neuron), *typed(y_SRC), _step(y_SRC), currents_4C.data_ptr())
         sizes = (self.timesteps, rows, channels, torch.get_num_threads())
-        fire(ctypes.addressof(self._neuron), *typed(y_SRC), _step(y_SRC), currents_4C.data_ptr(), *where, *sizes)
+        if form == "bits":
+            spikes = torch.empty(self.timesteps, rows, -(-channels // 32), dtype=torch.int32)
+            library().snn_fire_bits(*what, spikes.data_ptr(), *sizes)
+        elif form == "mean":
+            spikes = torch.empty(1, rows, channels)
+            library().snn_fire_mean(*what, spikes.data_ptr(), *sizes)
+        else:
+            dtype = torch.float32 if form == "floats" else y_SRC.dtype
+            spikes = torch.empty(self.timesteps, rows, channels, dtype=dtype)
+            library().snn_fire(*what, *typed(spikes), *sizes)
         return spikes
 
     def unfire(self, y_SRC: Tensor, currents_4C: Tensor, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,15 +227,18 @@ class _Spikes(torch.autograd.Function):
         b_C: Tensor | None,
         neurons: Neurons,
         currents_4C: Tensor,
-        dtype: torch.dtype,
+        form: Form,
     ) -> tuple[Tensor, Tensor | None]:
         ctx.save_for_backward(y_SRC, currents_4C)
-        ctx.neurons, ctx.has_bias = neurons, b_C is not None
-        return neurons._fired(y_SRC, currents_4C, dtype)
+        ctx.neurons, ctx.has_bias, ctx.is_mean = neurons, b_C is not None, form == "mean"
+        return neurons._fired(y_SRC, currents_4C, form)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        grad_y_SRC, (grad_a_C, grad_b_C) = ctx.neurons.unfire(*ctx.saved_tensors, gradients[0])
+        steps, grad_TRC = ctx.neurons.timesteps, gradients[0]
+        if ctx.is_mean:
+            grad_TRC = (grad_TRC / steps).expand(steps, -1, -1)
+        grad_y_SRC, (grad_a_C, grad_b_C) = ctx.neurons.unfire(*ctx.saved_tensors, grad_TRC)
         return grad_y_SRC, grad_a_C, grad_b_C if ctx.has_bias else None, None, None, None
 
 

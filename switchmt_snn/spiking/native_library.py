@@ -37,6 +37,7 @@ _ARGUMENTS = {
     "snn_currents": "ppppfpl",
     "snn_fire": "ppilppillli",
     "snn_fire_bits": "ppilppllli",
+    "snn_fire_mean": "ppilppllli",
     "snn_unfire": "ppilppilpppllli",
     "snn_moments": "pipplli",
     "snn_images": "pfpillli",

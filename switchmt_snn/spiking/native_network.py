@@ -12,7 +12,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from switchmt_snn.spiking.native import Neurons, Spikes, batch_moments, scaled_images
+from switchmt_snn.spiking.native import Form, Neurons, Spikes, batch_moments, scaled_images
 from switchmt_snn.spiking.native_products import Synapses, connected, convolved, spikes_as_bits
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
@@ -30,9 +30,9 @@ class NativeNetwork:
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
         """Raises ValueError for a network that the native engine has no code for."""
         self._network = network
+        self._parameters = list(network.parameters())
         self._dtype = torch.float32 if precision is None else precision
-        self._form = torch.int32 if spikes_as_bits(self._dtype) else self._dtype
-        """What spikes are kept as: bits, or numbers of the products' dtype."""
+        self._form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
         self._neurons = Neurons(network.config)
         self._frozen: tuple[int, dict[str, Synapses]] | None = None
 
@@ -47,13 +47,13 @@ class NativeNetwork:
 
     def synapses(self) -> dict[str, Synapses]:
         """All layers' synapses as they are now, by layer name; those of a network without gradients are kept."""
-        version = sum(parameter._version for parameter in self._network.parameters())
+        version = sum(parameter._version for parameter in self._parameters)
         if self._frozen is not None and self._frozen[0] == version:
             return self._frozen[1]
         network = self._network
         owners = {name: [layer] for name, layer in network.trunk.items()} | {_STREAMS: [*network.streams.values()]}
         synapses = {name: Synapses.of(_layers(parts), self._dtype) for name, parts in owners.items()}
-        if not any(parameter.requires_grad for parameter in network.parameters()):
+        if not any(parameter.requires_grad for parameter in self._parameters):
             self._frozen = version, synapses
         return synapses
 
@@ -68,11 +68,13 @@ class NativeNetwork:
         for (name, stream), size in zip(network.streams.items(), sizes, strict=True):
             dendrites = cast(Stream, stream).dendrites
             gains.append(torch.ones(size) if dendrites is None else dendrites.gains(*context[name]).expand(size))
-        spikes_TBN = self._neurons.gated(y_TBN, torch.cat(gains), torch.float32).numbers
-        if network.config.readout == "mean":
-            spikes_TBN = spikes_TBN.mean(0, keepdim=True)
-        parts = zip(network.streams.items(), spikes_TBN.split(sizes, dim=-1), strict=True)
-        return network.combine({name: network.read_out(cast(Stream, stream), part) for (name, stream), part in parts})
+        over_time = network.config.readout == "mean"
+        spikes_TBN = self._neurons.gated(y_TBN, torch.cat(gains), "mean" if over_time else "floats").numbers
+        outputs = {}
+        for (name, layer), part_TBN in zip(network.streams.items(), spikes_TBN.split(sizes, dim=-1), strict=True):
+            stream = cast(Stream, layer)
+            outputs[name] = stream.head(part_TBN[0]) if over_time else network.read_out(stream, part_TBN)
+        return network.combine(outputs)
 
     def _trunk_layer(
         self, layer: TrunkLayer, x: Spikes, context: tuple[Tensor, ...], synapses: Synapses, training: bool
@@ -94,7 +96,7 @@ class NativeNetwork:
             (mean_C, var_C),
             normalization.epsilon,
             of_batch=training,
-            dtype=self._form,
+            form=self._form,
         )
         return spikes.with_rows(y.shape[1:-1])
 
