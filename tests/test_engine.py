@@ -23,7 +23,7 @@ from switchmt_snn.spiking.network import ObservationSpec, build_network
 from tests.conftest import small_config
 
 CPU = torch.device("cpu")
-IMAGES = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
+SIDES = {"nature": 84, "minatar": 10, "mlp": 10}
 
 
 def minatar(**network: Any) -> ExperimentConfig:
@@ -33,20 +33,28 @@ def minatar(**network: Any) -> ExperimentConfig:
 
 def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | None, task: int) -> dict[str, Any]:
     """The three values of an update, the gradients of a sum over the first, and the running statistics."""
-    network, target = build_network(config.network, IMAGES, 1), build_network(config.network, IMAGES, 2)
+    side = SIDES[config.network.trunk]
+    images = ObservationSpec((4, side, side), 1, 1.0, True, 6, 3)
+    network, target = build_network(config.network, images, 1), build_network(config.network, images, 2)
     target.eval()
     torch.manual_seed(task)
-    x, following = (torch.rand(2, 8, *IMAGES.shape) < 0.4).to(torch.uint8)
+    for name, buffer in (*network.named_buffers(), *target.named_buffers()):
+        if "running" in name:  # other ones for every task
+            buffer.copy_(torch.rand(buffer.shape) + (0.5 if "var" in name else -0.5))
+    for part in (*network.parameters(), *target.parameters()):
+        part.data = (part.data * 256).round() / 256  # sums of products are exact, so that no spike hangs on their order
+    x, following = (torch.rand(2, 8, *images.shape) < 0.4).to(torch.uint8)
     evaluate = make_evaluate(network, target, engine, precision, double_q=True)
     values = evaluate(x, following, task, torch.Generator().manual_seed(5))
     q_BA = values.q_BA
     (q_BA * torch.linspace(-1, 2, q_BA.numel()).view_as(q_BA)).sum().backward()
     assert not values.next_BA.requires_grad
     assert not torch.equal(values.next_BA, values.choice_BA)
-    # Each gradient in units of its tensor's largest, which is what Adam makes of it; but a bias before BatchNorm has
+    # Each gradient in units of its tensor's largest, which is what Adam makes of it; but biases before BatchNorm have
     # none except rounding.
     grads = {
-        name: p.grad / (1.0 if name.endswith("conv1.synapses.bias") else p.grad.abs().max().clamp(min=1e-9))
+        name: p.grad
+        / (1.0 if "conv" in name and name.endswith("synapses.bias") else p.grad.abs().max().clamp(min=1e-9))
         for name, p in network.named_parameters()
         if p.grad is not None
     }
@@ -54,6 +62,7 @@ def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | No
 
 
 compiles = pytest.mark.skipif(machine.compile_problem() is not None, reason="nothing can be compiled here")
+builds = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
 
 
 @compiles
@@ -77,17 +86,30 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
     _compare_to_rounding("compiled", network)
 
 
-@pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
+@builds
 @pytest.mark.parametrize(
     "network",
     [
         {},
-        {"neuron": "LIF", "reset": "subtract", "surrogate": "fast_sigmoid", "dendrites": "per_neuron"},
+        {
+            "neuron": "LIF",
+            "reset": "subtract",
+            "surrogate": "fast_sigmoid",
+            "dendrites": "per_neuron",
+            "threshold": 0.2,
+        },
         {"encoding": "rate", "readout": "max_membrane", "method": "DSQN_D"},
-        {"encoding": "latency", "readout": "last_membrane", "normalization": "shared", "timesteps": 1},
-        {"trunk": "mlp"},
+        {
+            "encoding": "latency",
+            "readout": "last_membrane",
+            "normalization": "shared",
+            "timesteps": 1,
+            "threshold": 0.2,
+        },
+        {"trunk": "mlp", "threshold": 0.2},
+        {"trunk": "nature", "threshold": 0.5},
     ],
-    ids=["default", "LIF-subtract", "rate", "latency", "mlp"],
+    ids=["default", "LIF-subtract", "rate", "latency", "mlp", "nature"],
 )
 def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
     _compare_to_rounding("native", network)
@@ -101,18 +123,34 @@ def _compare_to_rounding(engine: str, network: dict[str, Any]) -> None:
             torch.testing.assert_close(
                 ours[name], theirs[name], rtol=1e-3, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
             )
-        moved = [ours[name][task if len(ours[name]) > 1 else 0] != 0 for name in ours if "running" in name]
-        assert network.get("trunk") == "mlp" or any(bool(row.any()) for row in moved)
+        assert all(ours[name].any() for name in ours if name.endswith("head.weight")), "no hidden neuron fires"
 
 
-@compiles
-@pytest.mark.parametrize("engine", ["compiled", "native"])
-def test_bfloat16_equals_eager_bfloat16(engine: str) -> None:
-    ours, theirs = (gradients(minatar(), name, torch.bfloat16, 0) for name in (engine, "eager"))
-    # bfloat16 has 8 bits; a product rounded the other way may move a spike, so most, not all, must agree.
+@pytest.mark.parametrize(
+    ("engine", "trunk", "has_amx"),
+    [
+        pytest.param("compiled", "minatar", False, marks=compiles),
+        pytest.param("native", "minatar", False, marks=builds),
+        pytest.param("native", "nature", False, marks=builds),
+        pytest.param("native", "nature", True, marks=builds),
+    ],
+)
+def test_bfloat16_equals_eager_bfloat16(
+    engine: str, trunk: str, has_amx: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Natively, products of bits, or, as with AMX, of numbers."""
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: has_amx)
+    config = minatar(trunk=trunk, threshold=0.5)
+    ours, theirs = (gradients(config, name, torch.bfloat16, 0) for name in (engine, "eager"))
+    exact = gradients(config, "eager", None, 0)
+    # bfloat16 has 8 bits; a product rounded the other way may move a spike, so most, not all, must agree. In the large
+    # network, bits (with exact biases) move many: there, they must be as near to float32 as eager bfloat16 is.
+    is_chaotic = trunk == "nature" and not has_amx
     for name in ours:
         close = torch.isclose(ours[name].float(), theirs[name].float(), rtol=0.05, atol=0.02)
-        assert close.float().mean() > 0.97 or not close.numel(), name
+        assert close.float().mean() > 0.97 or not close.numel() or is_chaotic, name
+        our_error, their_error = ((x[name].float() - exact[name]).abs().sum() for x in (ours, theirs))
+        assert our_error <= 1.3 * their_error + 0.01 * close.numel(), name
 
 
 def test_a_run_keeps_the_engine_it_began_with() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -16,10 +15,9 @@ from torch import Tensor
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning import machine
-from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.replay import Batch
 from switchmt_snn.spiking import native_library
 from switchmt_snn.spiking.native import Neurons, batch_moments, scaled_images
+from switchmt_snn.spiking.native_network import NativeNetwork
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.spiking.neurons import SpikingLayer
 from tests.conftest import small_config
@@ -180,23 +178,23 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
 
 
 @builds
-def test_the_target_is_rounded_anew_after_its_copy() -> None:
-    """Its rounded weights are kept between copies, and only between them."""
-    spec, rng = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), np.random.default_rng(0)
-    images = (rng.random((2, 8, 4, 10, 10)) < 0.4).astype(np.uint8)
-    rewards, never = rng.normal(size=8).astype(np.float32), np.zeros(8, np.bool_)
-    batch = Batch(images[0], rng.integers(0, 6, 8), rewards, images[1], never)
-    losses = []
-    for engine in ("native", "eager"):
-        config = small_config(network={"trunk": "minatar"}, learning={"engine": engine})
-        network = build_network(config.network, spec, 1)
-        learner = Learner(network, config.learning, np.ones((3, 6), np.bool_), CPU, 0)
-        for number in range(6):
-            learner.update(batch, 0)
-            if number == 2:
-                learner.copy_target()
-        losses.append(learner.take_means()["loss"])
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+def test_a_target_is_read_anew_after_its_copy() -> None:
+    """Its synapses are kept between copies, and only between them."""
+    spec = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
+    config = small_config(network={"trunk": "minatar"}).network
+    network, target = build_network(config, spec, 1), build_network(config, spec, 2).requires_grad_(False)
+    native = NativeNetwork(target, torch.bfloat16)
+    before = native.synapses()
+    assert native.synapses() is before
+    target.load_state_dict(network.state_dict())
+    after, fresh = native.synapses(), NativeNetwork(network, torch.bfloat16).synapses()
+    assert after is not before
+    for name, synapses in fresh.items():
+        assert not torch.equal(after[name].weight, before[name].weight)
+        for part in ("weight", "bias", "matrix"):
+            assert torch.equal(getattr(after[name], part), getattr(synapses, part))
+    learning = NativeNetwork(network, None)
+    assert learning.synapses() is not learning.synapses()
 
 
 @pytest.mark.parametrize(
@@ -219,7 +217,7 @@ def test_what_it_has_no_code_for_is_refused_by_name(setting: dict[str, Any], nam
 def test_auto_is_native_on_the_nature_trunk(has_bits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In float32 only where the processor has products of bits."""
     monkeypatch.setattr(machine, "native_obstacle", lambda config, device: None)
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512" if has_bits else "AVX2")
+    monkeypatch.setattr(machine, "spikes_as_bits", lambda dtype: has_bits)
 
     def settled(trunk: str, precision: str, engine: str = "auto") -> tuple[str, list[str]]:
         asked = small_config(network={"trunk": trunk}, learning={"precision": precision, "engine": engine})
@@ -229,12 +227,17 @@ def test_auto_is_native_on_the_nature_trunk(has_bits: bool, monkeypatch: pytest.
     engine, words = settled("nature", "bfloat16")
     assert engine == "native"
     assert "C++" in words[-1]
-    assert settled("nature", "float32")[0] == ("native" if has_bits else "eager")
+    engine, words = settled("nature", "float32")
+    assert engine == ("native" if has_bits else "eager")
+    assert has_bits or "AVX-512" in words[-1]
     assert settled("minatar", "bfloat16")[0] == settled("nature", "bfloat16", "eager")[0] == "eager"
     monkeypatch.setattr(machine, "native_obstacle", lambda config, device: "expected luck")
     engine, words = settled("nature", "bfloat16")
     assert engine == "eager"
     assert "expected luck" in words[-1]
+    ann = small_config(network={"trunk": "nature", "method": "DQN_D"}, learning={"precision": "float32"})
+    config, words = machine.settle(ann, None, CPU)
+    assert (config.learning.engine, words) == ("eager", [])
 
 
 @builds

@@ -84,8 +84,10 @@ def _settle_engine(
             raise unavailable("a run on a CUDA device", f"this one is on device {device.type}")
         return "graph", []
     notes = []
-    if engine == "native" or (engine == "auto" and native_pays(config, precision, device)):
+    if engine == "native" or (engine == "auto" and native_may_pay(config, device)):
         obstacle = native_obstacle(config, device)
+        if obstacle is None and engine == "auto" and precision == "float32" and not spikes_as_bits(torch.float32):
+            obstacle = "it is faster in float32 only with AVX-512"
         if obstacle is None:
             said = "updates run natively: spikes and neurons in C++ (learning.engine=eager does without)"
             return "native", [said] if engine == "auto" else []
@@ -135,12 +137,12 @@ def compiling_pays(config: ExperimentConfig) -> bool:
     return planned_updates(config) >= COMPILE_FROM_UPDATES
 
 
-def native_pays(config: ExperimentConfig, precision: str, device: torch.device) -> bool:
-    """Whether ``auto`` takes the native engine, which is the fastest for the nature trunk (docs/performance.md) if its
+def native_may_pay(config: ExperimentConfig, device: torch.device) -> bool:
+    """Whether ``auto`` tries the native engine: on the nature trunk it is the fastest (docs/performance.md) if its
     products of spikes are those of bits, or the others are bfloat16. MinAtar's small network is faster compiled.
     """
-    has_bits = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
-    return device.type == "cpu" and config.network.trunk == "nature" and (has_bits or precision == "bfloat16")
+    spiking = METHOD_TRAITS[config.network.method].spiking
+    return device.type == "cpu" and config.network.trunk == "nature" and spiking
 
 
 def native_obstacle(config: ExperimentConfig, device: torch.device) -> str | None:

@@ -1,6 +1,7 @@
 """A network's decision through the native neuron layers: the same function as :meth:`QNetwork.decide`.
 
-Products are PyTorch's (oneDNN), with channels innermost; what lies between them is :mod:`switchmt_snn.spiking.native`.
+Synaptic products are :mod:`switchmt_snn.spiking.native_products`', neurons :mod:`switchmt_snn.spiking.native`'s, and
+channels lie innermost.
 
 Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons.
 """
@@ -23,8 +24,9 @@ _STREAMS = "streams"
 class NativeNetwork:
     """Q-values of a network that is read at every call.
 
-    With ``torch.bfloat16``, synaptic products and their gradients are rounded as under autocast; all else is float32.
-    Everything is on the CPU.
+    With ``torch.bfloat16``, weights, synaptic products and the gradients of products and inputs are rounded to it, as
+    under autocast; where spikes are bits, biases and the gradients of weights are not. All else is float32. Everything
+    is on the CPU.
     """
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
