@@ -179,22 +179,25 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
 
 @builds
 def test_a_target_is_read_anew_after_its_copy() -> None:
-    """Its synapses are kept between copies, and only between them."""
+    """Its weights are kept between copies, and only between them."""
     spec = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
     config = small_config(network={"trunk": "minatar"}).network
     network, target = build_network(config, spec, 1), build_network(config, spec, 2).requires_grad_(False)
     native = NativeNetwork(target, torch.bfloat16)
-    before = native.synapses()
-    assert native.synapses() is before
+    before = native.weights(1)
+    assert native.weights(1) is before
+    assert native.weights(0).synapses is before.synapses
     target.load_state_dict(network.state_dict())
-    after, fresh = native.synapses(), NativeNetwork(network, torch.bfloat16).synapses()
-    assert after is not before
-    for name, synapses in fresh.items():
-        assert not torch.equal(after[name].weight, before[name].weight)
+    learning = NativeNetwork(network, torch.bfloat16)
+    after, fresh = native.weights(1), learning.weights(1)
+    assert not torch.equal(after.gain_N, before.gain_N)
+    assert torch.equal(after.gain_N, fresh.gain_N)
+    assert not torch.equal(after.gain_N, native.weights(0).gain_N)
+    for name, synapses in fresh.synapses.items():
+        assert not torch.equal(after.synapses[name].weight, before.synapses[name].weight)
         for part in ("weight", "bias", "matrix"):
-            assert torch.equal(getattr(after[name], part), getattr(synapses, part))
-    learning = NativeNetwork(network, None)
-    assert learning.synapses() is not learning.synapses()
+            assert torch.equal(getattr(after.synapses[name], part), getattr(synapses, part))
+    assert learning.weights(1) is not fresh
 
 
 @pytest.mark.parametrize(

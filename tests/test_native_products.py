@@ -166,7 +166,7 @@ def test_a_processor_without_the_instructions_computes_the_same(
             part.data = (part.data * 256).round() / 256  # exact sums: no spike hangs on their order
         native = NativeNetwork(network, None)
         inputs = native.inputs(x, torch.Generator().manual_seed(0))
-        q = native.decide(inputs, network.context(0), native.synapses(), training=True)
+        (q,) = native.decide(inputs, native.weights(0), training=True)
         q.square().sum().backward()
         grads = {name: part.grad for name, part in network.named_parameters() if part.grad is not None}
         results.append((q.detach(), grads))

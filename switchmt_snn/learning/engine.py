@@ -98,16 +98,14 @@ def _evaluate_natively(network: QNetwork, target: QNetwork, precision: torch.dty
     ours, theirs = NativeNetwork(network, precision), NativeNetwork(target, precision)
 
     def evaluate(observation: Tensor, following: Tensor, task: int, generator: torch.Generator) -> Values:
-        context, synapses = network.context(task), ours.synapses()
+        x_next = theirs.inputs(following, generator)
         with torch.no_grad():
-            x_next = theirs.inputs(following, generator)
-            choice_BA = next_BA = theirs.decide(x_next, target.context(task), theirs.synapses(), training=False)
-            if double_q:
-                if network.encoder.is_random:
-                    x_next = ours.inputs(following, generator)
-                choice_BA = ours.decide(x_next, context, synapses, training=False)
-        x = ours.inputs(observation, generator)
-        return Values(ours.decide(x, context, synapses, training=True), next_BA, choice_BA)
+            (next_BA,) = theirs.decide(x_next, theirs.weights(task), training=False)
+        if double_q and network.encoder.is_random:
+            x_next = ours.inputs(following, generator)
+        x, beside = ours.inputs(observation, generator), [x_next] if double_q else []
+        q_BA, *choice = ours.decide(x, ours.weights(task), training=True, beside=beside)
+        return Values(q_BA, next_BA, *(choice or [next_BA]))
 
     return evaluate
 

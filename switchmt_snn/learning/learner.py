@@ -133,7 +133,7 @@ class Learner(Stateful):
             target_B = td_target(rewards_B, batch.terminated_B, q_next_BA, q_choice_BA, config.discount)
         q_B = q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
         loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.network.zero_grad(set_to_none=True)
         loss.backward()
         if config.gradient_clip == "value":
             torch.nn.utils.clip_grad_value_(self.network.parameters(), config.gradient_clip_at)

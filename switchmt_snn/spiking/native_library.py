@@ -1,4 +1,4 @@
-"""``native.cpp`` and ``native_products.cpp`` as a library: compiled by the machine's C++ compiler at its first use, for
+"""The C++ sources beside this file as a library: compiled by the machine's C++ compiler at its first use, for
 the processor at hand, kept in the user's cache, and loaded. Its parallel loops run in PyTorch's own pool of threads.
 """
 
@@ -20,7 +20,9 @@ import torch  # also brings the OpenMP that the sources are linked against
 from torch import Tensor
 
 _HEADER = Path(__file__).with_name("native_numbers.h")
-_SOURCES = tuple(Path(__file__).with_name(name) for name in ("native.cpp", "native_products.cpp"))
+_SOURCES = tuple(
+    Path(__file__).with_name(name) for name in ("native.cpp", "native_products.cpp", "native_bfloat16.cpp")
+)
 # No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
 _FLAGS = (
     "-std=c++17",
@@ -43,6 +45,7 @@ _ARGUMENTS = {
     "snn_images": "pfpillli",
 }
 """Pointers, ints, longs and floats that the functions take."""
+# Those that are there if ``snn_has_products`` or ``snn_has_bfloat16`` says so.
 _PRODUCTS = {
     "snn_windows": "pplllllli",
     "snn_flat": "ppllli",
@@ -50,7 +53,12 @@ _PRODUCTS = {
     "snn_multiply": "pipppllli",
     "snn_multiply_transposed": "pipppllli",
 }
-"""Those that are there if ``snn_has_products`` says so."""
+_BFLOAT16 = {
+    "snn_convolve": "ppppllllllli",
+    "snn_input_gradient": "pppllllllli",
+    "snn_weight_gradient": "ppppllllllli",
+    "snn_matrix_product": "pppllli",
+}
 
 
 @functools.cache
@@ -75,7 +83,9 @@ def library() -> ctypes.CDLL:
                 os.close(handle)
                 shutil.copyfile(built, beside)
                 os.replace(beside, kept)
-    for name, kinds in {**_ARGUMENTS, **(_PRODUCTS if loaded.snn_has_products() else {})}.items():
+    products = _PRODUCTS if loaded.snn_has_products() else {}
+    bfloat16 = _BFLOAT16 if loaded.snn_has_bfloat16() else {}
+    for name, kinds in (_ARGUMENTS | products | bfloat16).items():
         function = getattr(loaded, name)
         function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
     return loaded

@@ -8,7 +8,8 @@ Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, 
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +20,16 @@ from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
 _STREAMS = "streams"
 """All streams have the same inputs, so their synapses are one layer."""
+
+
+class Weights(NamedTuple):
+    """A network as it is now, for one task."""
+
+    synapses: dict[str, Synapses]
+    """By layer name."""
+    gain_N: Tensor
+    """Of the dendrites of all streams, one after the other."""
+    context: Context
 
 
 class NativeNetwork:
@@ -36,7 +47,9 @@ class NativeNetwork:
         self._dtype = torch.float32 if precision is None else precision
         self._form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
         self._neurons = Neurons(network.config)
-        self._frozen: tuple[int, dict[str, Synapses]] | None = None
+        self._version = -1
+        self._synapses: dict[str, Synapses] = {}
+        self._by_task: dict[int, Weights] = {}
 
     def inputs(self, observation: Tensor, generator: torch.Generator) -> Tensor:
         """Encoded inputs ``[S, B, H, W, C]`` or ``[S, B, C]`` in the products' dtype for raw observations."""
@@ -47,32 +60,42 @@ class NativeNetwork:
         x = network.encode(observation, generator).to(self._dtype)
         return x.movedim(2, -1).contiguous()
 
-    def synapses(self) -> dict[str, Synapses]:
-        """All layers' synapses as they are now, by layer name; those of a network without gradients are kept."""
+    def weights(self, task: int) -> Weights:
+        """For a task, as they are now; those of a network without gradients are kept until they change."""
         version = sum(parameter._version for parameter in self._parameters)
-        if self._frozen is not None and self._frozen[0] == version:
-            return self._frozen[1]
-        network = self._network
-        owners = {name: [layer] for name, layer in network.trunk.items()} | {_STREAMS: [*network.streams.values()]}
-        synapses = {name: Synapses.of(_layers(parts), self._dtype) for name, parts in owners.items()}
-        if not any(parameter.requires_grad for parameter in self._parameters):
-            self._frozen = version, synapses
-        return synapses
+        if version != self._version or any(parameter.requires_grad for parameter in self._parameters):
+            layers = {name: [layer] for name, layer in self._network.trunk.items()}
+            layers[_STREAMS] = [*self._network.streams.values()]
+            self._synapses = {name: Synapses.of(_modules(owners), self._dtype) for name, owners in layers.items()}
+            self._version, self._by_task = version, {}
+        if task not in self._by_task:
+            context = self._network.context(task)
+            gains = [_gains(cast(Stream, stream), context[name]) for name, stream in self._network.streams.items()]
+            self._by_task[task] = Weights(self._synapses, torch.cat(gains), context)
+        return self._by_task[task]
 
-    def decide(self, x: Tensor, context: Context, synapses: dict[str, Synapses], training: bool) -> Tensor:
-        """Q-values ``[B, A]`` of :meth:`inputs` in a task's context; normalisation as ``training`` says."""
-        network, spikes = self._network, Spikes(x)
-        for name, layer in network.trunk.items():
+    def decide(self, x: Tensor, weights: Weights, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
+        """Q-values ``[B, A]`` of :meth:`inputs`, normalised as ``training`` says; and after them those of other inputs,
+        normalised by the running statistics and without gradient."""
+        with torch.no_grad():  # first: training moves the running statistics
+            others = [self._features(other, weights, training=False) for other in beside]
+        y_TBN, *others_TBN = connected(self._features(x, weights, training), weights.synapses[_STREAMS], others)
+        q_BA = self._read_out(y_TBN, weights)
+        with torch.no_grad():
+            return [q_BA, *(self._read_out(other_TBN, weights) for other_TBN in others_TBN)]
+
+    def _features(self, x: Tensor, weights: Weights, training: bool) -> Spikes:
+        """What the trunk sends to the streams."""
+        spikes, (synapses, _, context) = Spikes(x), weights
+        for name, layer in self._network.trunk.items():
             spikes = self._trunk_layer(cast(TrunkLayer, layer), spikes, context[name], synapses[name], training)
-        y_TBN = connected(spikes, synapses[_STREAMS])
-        sizes = [bias.shape[0] for bias in synapses[_STREAMS].parameters[1::2]]
-        gains = []
-        for (name, stream), size in zip(network.streams.items(), sizes, strict=True):
-            dendrites = cast(Stream, stream).dendrites
-            gains.append(torch.ones(size) if dendrites is None else dendrites.gains(*context[name]).expand(size))
-        over_time = network.config.readout == "mean"
-        spikes_TBN = self._neurons.gated(y_TBN, torch.cat(gains), "mean" if over_time else "floats").numbers
-        outputs = {}
+        return spikes
+
+    def _read_out(self, y_TBN: Tensor, weights: Weights) -> Tensor:
+        """Q-values of the streams' synaptic products, which lie one after the other."""
+        network, over_time = self._network, self._network.config.readout == "mean"
+        spikes_TBN = self._neurons.gated(y_TBN, weights.gain_N, "mean" if over_time else "floats").numbers
+        sizes, outputs = [bias.shape[0] for bias in weights.synapses[_STREAMS].parameters[1::2]], {}
         for (name, layer), part_TBN in zip(network.streams.items(), spikes_TBN.split(sizes, dim=-1), strict=True):
             stream = cast(Stream, layer)
             outputs[name] = stream.head(part_TBN[0]) if over_time else network.read_out(stream, part_TBN)
@@ -83,7 +106,7 @@ class NativeNetwork:
     ) -> Spikes:
         """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``, as the next layer reads them."""
         if layer.normalization is None:
-            y_SBN = connected(x, synapses)
+            (y_SBN,) = connected(x, synapses)
             return self._neurons.gated(y_SBN, None, self._form)
         y = convolved(x, synapses)
         y_SRC = y.flatten(1, -2)
@@ -103,7 +126,12 @@ class NativeNetwork:
         return spikes.with_rows(y.shape[1:-1])
 
 
-def _layers(owners: list[nn.Module]) -> list[nn.Linear | nn.Conv2d]:
+def _gains(stream: Stream, context: tuple[Tensor, ...]) -> Tensor:
+    size = stream.synapses.out_features
+    return torch.ones(size) if stream.dendrites is None else stream.dendrites.gains(*context).expand(size)
+
+
+def _modules(owners: list[nn.Module]) -> list[nn.Linear | nn.Conv2d]:
     """The modules that have the synapses."""
     synapses = (cast(TrunkLayer | Stream, owner).synapses for owner in owners)
     return [cast(nn.Linear | nn.Conv2d, part[-1] if isinstance(part, nn.Sequential) else part) for part in synapses]

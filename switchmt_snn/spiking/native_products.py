@@ -1,5 +1,6 @@
 """Synaptic products with their gradients. Those of spikes that are kept as bits are float32 sums of weights
-(``native_products.cpp``, AVX-512), at several times the speed of multiplications; all others are PyTorch's (oneDNN).
+(``native_products.cpp``, AVX-512), at several times the speed of multiplications; all others are of numbers
+(:mod:`~switchmt_snn.spiking.native_dense`).
 
 Shapes: T steps, B batch, I = T * B images, H, W places, C channels in, O channels out, K inputs of an output.
 """
@@ -15,16 +16,23 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from switchmt_snn.spiking.native import Spikes
+from switchmt_snn.spiking.native_dense import (
+    convolution,
+    convolution_input_gradient,
+    convolution_weight_gradient,
+    has_amx,
+    matrix_product,
+    out_side,
+)
 from switchmt_snn.spiking.native_library import library, typed
 
 _LANES = 64
 
 
 def spikes_as_bits(dtype: torch.dtype) -> bool:
-    """Whether products of spikes in a dtype are those of bits here: the processor needs AVX-512. bfloat16 is left to
-    multiplications where they have their own unit (AMX), which by its peak is faster; that was not measured."""
-    has_amx = bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
-    return bool(library().snn_has_products()) and not (dtype == torch.bfloat16 and has_amx)
+    """Whether products of spikes in a dtype are those of bits here: the processor needs AVX-512, and for bfloat16 no
+    AMX."""
+    return bool(library().snn_has_products()) and not (dtype == torch.bfloat16 and has_amx())
 
 
 class Synapses(NamedTuple):
@@ -35,8 +43,6 @@ class Synapses(NamedTuple):
     weight: Tensor
     """In the products' dtype, channels innermost."""
     bias: Tensor
-    matrix: Tensor
-    """The weights ``[O, bits]`` for products of bits, a convolution's filled up to whole words of channels."""
     stride: int
 
     @classmethod
@@ -46,18 +52,20 @@ class Synapses(NamedTuple):
         parameters = tuple(cast(Tensor, part) for layer in layers for part in (layer.weight, layer.bias))
         weights, biases = parameters[::2], parameters[1::2]
         if isinstance(layers[0], nn.Conv2d):
-            weight = channels_last(weights[0].to(dtype))
-            missing = -weight.shape[1] % 32
-            matrix = weight.permute(0, 2, 3, 1)
-            matrix = (F.pad(matrix, (0, missing)) if missing else matrix).flatten(1)
-            return cls(parameters, weight, biases[0].detach(), matrix, layers[0].stride[0])
-        if len(layers) == 1:
-            weight = weights[0].detach().to(dtype)
-        else:
-            weight = torch.empty(sum(part.shape[0] for part in weights), weights[0].shape[1], dtype=dtype)
-            for rows, part in zip(weight.split([part.shape[0] for part in weights]), weights, strict=True):
-                rows.copy_(part)
-        return cls(parameters, weight, torch.cat(biases), weight, 0)
+            weight = weights[0].detach().to(dtype, memory_format=torch.channels_last)
+            return cls(parameters, weight, biases[0].detach(), layers[0].stride[0])
+        weight = torch.empty(sum(part.shape[0] for part in weights), weights[0].shape[1], dtype=dtype)
+        for rows, part in zip(weight.split([part.shape[0] for part in weights]), weights, strict=True):
+            rows.copy_(part)
+        return cls(parameters, weight, torch.cat(biases), 0)
+
+    @property
+    def matrix(self) -> Tensor:
+        """The weights ``[O, bits]`` for products of bits, a convolution's filled up to whole words of channels."""
+        if self.weight.dim() == 2:
+            return self.weight
+        matrix, missing = self.weight.permute(0, 2, 3, 1), -self.weight.shape[1] % 32
+        return (F.pad(matrix, (0, missing)) if missing else matrix).flatten(1)
 
 
 class Panels(NamedTuple):
@@ -80,7 +88,7 @@ class Panels(NamedTuple):
             ValueError: the words are not contiguous int32.
         """
         images, height, width, words = bits_IHWw.shape
-        lanes = images * _outputs(height, kernel, stride) * _outputs(width, kernel, stride)
+        lanes = images * out_side(height, kernel, stride) * out_side(width, kernel, stride)
         panels = cls.empty(lanes, kernel * kernel * words * 32)
         sizes = (*bits_IHWw.shape, kernel, stride, torch.get_num_threads())
         library().snn_windows(_words(bits_IHWw), panels.words.data_ptr(), *sizes)
@@ -154,24 +162,27 @@ def convolved(x: Spikes, synapses: Synapses) -> Tensor:
         return y.permute(0, 2, 3, 1).unflatten(0, steps)  # type: ignore[no-any-return]
     panels = Panels.of_windows(x.bits.flatten(0, 1), kernel, stride)
     y = _SpikeConvolution.apply(numbers_ICHW, synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
-    return y.view(*steps, *(_outputs(side, kernel, stride) for side in sides), -1)  # type: ignore[no-any-return]
+    return y.view(*steps, *(out_side(side, kernel, stride) for side in sides), -1)  # type: ignore[no-any-return]
 
 
-def connected(x: Spikes, synapses: Synapses) -> Tensor:
+def connected(x: Spikes, synapses: Synapses, beside: Sequence[Spikes] = ()) -> list[Tensor]:
     """Products ``[T, B, O]`` of fully connected layers for ``[T, B, K]``, or for images ``[T, B, H, W, C]`` that are
-    flattened in the order ``[C, H, W]``."""
-    numbers_IK = x.numbers.flatten(0, 1).movedim(-1, 1).flatten(1)
+    flattened in the order ``[C, H, W]``; and after them those of others with the same weights, without gradient."""
+    everyone = (*beside, x)
     if x.bits is None:
-        y = _Linear.apply(numbers_IK, synapses, *synapses.parameters)  # type: ignore[no-untyped-call]
+        ys = []
+        for one in everyone:
+            with torch.set_grad_enabled(one is x and torch.is_grad_enabled()):
+                ys.append(_Linear.apply(_flat(one), synapses, *synapses.parameters))  # type: ignore[no-untyped-call]
     else:
-        panels = Panels.of_images(x.bits.flatten(0, 1), x.numbers.shape[-1])
-        y = _SpikeLinear.apply(numbers_IK, synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
-    return y.unflatten(0, x.numbers.shape[:2])  # type: ignore[no-any-return]
+        panels = [Panels.of_images(cast(Tensor, one.bits).flatten(0, 1), one.numbers.shape[-1]) for one in everyone]
+        ys = _SpikeLinear.apply(_flat(x), synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
+    *others, y = (y.unflatten(0, one.numbers.shape[:2]) for y, one in zip(ys, everyone, strict=True))
+    return [y, *others]
 
 
-def channels_last(x: Tensor) -> Tensor:
-    """The same numbers, those of images with channels innermost."""
-    return x.contiguous(memory_format=torch.channels_last) if x.dim() == 4 else x
+def _flat(x: Spikes) -> Tensor:
+    return x.numbers.flatten(0, 1).movedim(-1, 1).flatten(1)
 
 
 def _words(bits: Tensor) -> int:
@@ -179,10 +190,6 @@ def _words(bits: Tensor) -> int:
     if bits.dtype != torch.int32 or not bits.is_cpu or not bits.is_contiguous():
         raise ValueError(f"{bits.dtype} with strides {bits.stride()} on {bits.device}, expected contiguous int32 words")
     return bits.data_ptr()
-
-
-def _outputs(side: int, kernel: int, stride: int) -> int:
-    return (side - kernel) // stride + 1
 
 
 # All of them take the layers' parameters last: they get the gradients, and what was made of them is read.
@@ -198,39 +205,37 @@ class _SpikeConvolution(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         grad_y, weight, stride = gradients[0].contiguous(), ctx.synapses.weight, ctx.synapses.stride
         out_channels, channels, kernel, _ = weight.shape
-        outputs = [_outputs(side, kernel, stride) for side in ctx.sides]
-        grad_y_IOhw = grad_y.view(-1, *outputs, out_channels).permute(0, 3, 1, 2)
-        grad_x = _input_gradient(grad_y_IOhw, weight, stride, ctx.sides)
+        places = [out_side(side, kernel, stride) for side in ctx.sides]
+        grad_y_IOhw = grad_y.view(-1, *places, out_channels).permute(0, 3, 1, 2)
+        grad_x = convolution_input_gradient(grad_y_IOhw, weight, stride, ctx.sides)
         grad_weight, grad_bias = ctx.panels.gradients(grad_y)
         grad_OkkC = grad_weight.view(out_channels, kernel, kernel, -1)[..., :channels]
         return grad_x, None, None, grad_OkkC.permute(0, 3, 1, 2), grad_bias
 
 
-def _input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: tuple[int, int]) -> Tensor:
-    """Of a convolution's input ``[I, C, *sides]``, with channels innermost."""
-    out_channels, channels, kernel, _ = weight.shape
-    unseen = [(side - kernel) % stride for side in sides]
-    if stride == 1 or kernel % stride or any(unseen):
-        return F.conv_transpose2d(grad_y, weight, stride=stride, output_padding=unseen)
-    # Inputs of one phase of the stride see a convolution with stride 1: all phases are its output channels, which
-    # oneDNN has in 0.7 of the time.
-    taps = kernel // stride
-    phased = weight.view(out_channels, channels, taps, stride, taps, stride).permute(3, 5, 1, 0, 2, 4)
-    phases = F.conv2d(grad_y, channels_last(phased.flatten(0, 2).flip(2, 3)), padding=taps - 1).permute(0, 2, 3, 1)
-    grad_x: Tensor = phases.unflatten(-1, (stride, stride, channels)).transpose(2, 3)
-    return grad_x.reshape(-1, *sides, channels).permute(0, 3, 1, 2)
-
-
 class _SpikeLinear(torch.autograd.Function):
+    """Of several panels, whose tables are made once; the gradient is the last one's."""
+
     @staticmethod
-    def forward(ctx: Any, numbers: Tensor, synapses: Synapses, panels: Panels, *parameters: Tensor) -> Tensor:
-        ctx.synapses, ctx.panels = synapses, panels
-        return panels.times(synapses.matrix, synapses.bias)
+    def forward(
+        ctx: Any, numbers: Tensor, synapses: Synapses, panels: Sequence[Panels], *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        ctx.synapses, ctx.panels = synapses, panels[-1]
+        weights = synapses.matrix, synapses.bias
+        lanes = [part.lanes for part in panels]
+        if any(number % _LANES for number in lanes[:-1]):
+            parts = tuple(part.times(*weights) for part in panels)
+        else:
+            words = torch.cat([part.words for part in panels])
+            parts = Panels(words, sum(lanes), panels[-1].bits).times(*weights).split(lanes)
+        ctx.mark_non_differentiable(*parts[:-1])
+        return parts
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        grad_y = gradients[0].contiguous()
-        return grad_y @ ctx.synapses.weight, None, None, *_by_layer(ctx.synapses, *ctx.panels.gradients(grad_y))
+        grad_y = gradients[-1].contiguous()
+        grad_x = matrix_product(grad_y, ctx.synapses.weight)
+        return grad_x, None, None, *_by_layer(ctx.synapses, *ctx.panels.gradients(grad_y))
 
 
 def _by_layer(synapses: Synapses, grad_weight: Tensor, grad_bias: Tensor) -> list[Tensor]:
@@ -241,26 +246,19 @@ def _by_layer(synapses: Synapses, grad_weight: Tensor, grad_bias: Tensor) -> lis
 
 
 class _Convolution(torch.autograd.Function):
-    """Its two gradients are asked for one by one: together, oneDNN takes up to 1.4 times as long."""
-
     @staticmethod
     def forward(ctx: Any, x: Tensor, synapses: Synapses, *parameters: Tensor) -> Tensor:
         ctx.save_for_backward(x)
         ctx.synapses = synapses
-        return channels_last(F.conv2d(x, synapses.weight, synapses.bias.to(x.dtype), synapses.stride))
+        return convolution(x, synapses.weight, synapses.bias, synapses.stride)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (x,), grad_y = ctx.saved_tensors, channels_last(gradients[0])
-        weight, stride = ctx.synapses.weight, ctx.synapses.stride
-
-        def gradient(of_x: bool, of_weight: bool) -> tuple[Tensor, ...]:
-            sizes = ([weight.shape[0]], [stride] * 2, [0, 0], [1, 1], False, [0, 0], 1)
-            mask = [of_x, of_weight, of_weight]
-            return torch.ops.aten.convolution_backward(grad_y, x, weight, *sizes, mask)  # type: ignore[no-any-return]
-
-        grad_x = gradient(True, False)[0] if ctx.needs_input_grad[0] else None
-        return grad_x, None, *(grad.to(torch.float32) for grad in gradient(False, True)[1:])
+        # Its two gradients are asked for one by one: together, oneDNN takes up to 1.4 times as long.
+        (x,), (grad_y,), (weight, stride) = ctx.saved_tensors, gradients, (ctx.synapses.weight, ctx.synapses.stride)
+        is_asked = ctx.needs_input_grad[0]
+        grad_x = convolution_input_gradient(grad_y, weight, stride, x.shape[2:]) if is_asked else None
+        return grad_x, None, *convolution_weight_gradient(x, grad_y, weight, stride)
 
 
 class _Linear(torch.autograd.Function):
@@ -273,6 +271,6 @@ class _Linear(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (x,), (grad_y,) = ctx.saved_tensors, gradients
-        grad_x = grad_y @ ctx.synapses.weight if ctx.needs_input_grad[0] else None
+        grad_x = matrix_product(grad_y, ctx.synapses.weight) if ctx.needs_input_grad[0] else None
         both = (grad_y.T @ x).to(torch.float32), grad_y.sum(0, dtype=torch.float32)
         return grad_x, None, *_by_layer(ctx.synapses, *both)
