@@ -32,6 +32,20 @@ inline Lanes surrogate(const Neuron& n, Lanes x) {
     return FAST_SIGMOID ? 1.0f / (z * z) : n.slope / 2 / (1.0f + z * z);
 }
 
+// currents [4][C]: scale, shift, center, inverse deviation of y * scale + shift = (y - mean) * a / deviation + b; without
+// a mean, scale is a, shift b and the rest 0. Without b, 0.
+void make_currents(const float* a, const float* b, const float* mean, const float* variance, float epsilon,
+                   float* currents, long channels) {
+    for (long c = 0; c < channels; c++) {
+        float inverse = mean ? 1.0f / std::sqrt(variance[c] + epsilon) : 0.0f;
+        float scale = mean ? a[c] * inverse : a[c], shift = b ? b[c] : 0.0f;
+        currents[c] = scale;
+        currents[channels + c] = mean ? shift - mean[c] * scale : shift;
+        currents[2 * channels + c] = mean ? mean[c] : 0.0f;
+        currents[3 * channels + c] = inverse;
+    }
+}
+
 // visit(t, membranes, which of them fired) for T steps of WIDTH channels of one row, or fewer.
 template <bool ZERO, class Y, class F>
 inline void integrate(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, long steps,
@@ -213,8 +227,11 @@ void with_types(bool low, bool other_low, F f) {  // all floats, all bfloat16, o
 
 extern "C" {
 
-// Spikes of T steps.
-void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, void* spikes, int spikes_low, long steps, long rows, long channels, int threads) {
+// Spikes of T steps; currents are made for them, and kept for their gradient.
+void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const float* a, const float* b, const float* mean,
+              const float* variance, float epsilon, float* currents, void* spikes, int spikes_low, long steps, long rows,
+              long channels, int threads) {
+    make_currents(a, b, mean, variance, epsilon, currents, channels);
     with_flag(n->zero, [&](auto zero) {
         with_types(y_low, spikes_low, [&](auto y_, auto s_) {
             fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (decltype(s_)*)spikes,
@@ -224,7 +241,10 @@ void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const floa
 }
 
 // The same spikes as bits: channel c is bit c % 32 of words [T][R][ceil(C / 32)].
-void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, void* words, long steps, long rows, long channels, int threads) {
+void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const float* a, const float* b,
+                   const float* mean, const float* variance, float epsilon, float* currents, void* words, long steps,
+                   long rows, long channels, int threads) {
+    make_currents(a, b, mean, variance, epsilon, currents, channels);
     with_flag(n->zero, [&](auto zero) {
         with_type(y_low, [&](auto y_) {
             fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (uint32_t*)words, steps,
@@ -234,28 +254,16 @@ void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const
 }
 
 // Their mean over the steps, floats [R][C].
-void snn_fire_mean(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, float* mean,
-                   long steps, long rows, long channels, int threads) {
+void snn_fire_mean(const Neuron* n, const void* y, int y_low, long y_step, const float* a, const float* b,
+                   const float* mean, const float* variance, float epsilon, float* currents, float* spikes, long steps,
+                   long rows, long channels, int threads) {
+    make_currents(a, b, mean, variance, epsilon, currents, channels);
     with_flag(n->zero, [&](auto zero) {
         with_type(y_low, [&](auto y_) {
-            fire_mean<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, mean, steps, rows,
+            fire_mean<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, spikes, steps, rows,
                                   channels, threads);
         });
     });
-}
-
-// currents [4][C]: scale, shift, center, inverse deviation of y * scale + shift = (y - mean) * a / deviation + b; without
-// a mean, scale is a, shift b and the rest 0. Without b, 0.
-void snn_currents(const float* a, const float* b, const float* mean, const float* variance, float epsilon,
-                  float* currents, long channels) {
-    for (long c = 0; c < channels; c++) {
-        float inverse = mean ? 1.0f / std::sqrt(variance[c] + epsilon) : 0.0f;
-        float scale = mean ? a[c] * inverse : a[c], shift = b ? b[c] : 0.0f;
-        currents[c] = scale;
-        currents[channels + c] = mean ? shift - mean[c] * scale : shift;
-        currents[2 * channels + c] = mean ? mean[c] : 0.0f;
-        currents[3 * channels + c] = inverse;
-    }
 }
 
 // Gradients of y, and of a and b (grad_ab [2][C]), from those of the spikes. With an inverse deviation, mean and deviation

@@ -65,6 +65,27 @@ class Spikes(NamedTuple):
         return Spikes(self.numbers.unflatten(1, shape), bits)
 
 
+class Currents(NamedTuple):
+    """How currents come from synaptic products: ``(y - mean) / sqrt(variance + epsilon) * a + b``, or ``y * a``."""
+
+    a_C: Tensor
+    b_C: Tensor | None = None
+    mean_C: Tensor | None = None
+    variance_C: Tensor | None = None
+    epsilon: float = 0.0
+
+    def places(self, channels: int) -> tuple[int | None, ...]:
+        """Where they lie.
+
+        Raises:
+            ValueError: something is not contiguous float32 for every channel.
+        """
+        for x in self[:4]:
+            if x is not None and (x.dtype != torch.float32 or x.shape != (channels,) or not x.is_contiguous()):
+                raise ValueError(f"{x.dtype} {tuple(x.shape)}, expected float32 for {channels} channels")
+        return tuple(None if x is None else x.data_ptr() for x in self[:4])
+
+
 class Neurons:
     """T steps of a network's neurons on synaptic products ``[S, R, C]``, floats or bfloat16.
 
@@ -84,7 +105,7 @@ class Neurons:
     def gated(self, y_SRC: Tensor, gain_C: Tensor | None, form: Form) -> Spikes:
         """Spikes for currents ``y * gain`` (None: 1)."""
         gain_C = torch.ones(y_SRC.shape[-1]) if gain_C is None else gain_C.contiguous()
-        return self._spikes(y_SRC, gain_C, None, _currents(y_SRC, gain_C), form)
+        return self._spikes(y_SRC, Currents(gain_C), form)
 
     def normalized(
         self,
@@ -101,28 +122,27 @@ class Neurons:
         ``of_batch``: the moments (mean and variance) are those of ``y``, and the gradient goes through them; else
         there is no gradient.
         """
-        currents_4C = _currents(y_SRC, weight_C, bias_C, moments, epsilon)
+        currents = Currents(weight_C, bias_C, *moments, epsilon)
         if of_batch:
-            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, form)
+            return self._spikes(y_SRC, currents, form)
         with torch.no_grad():
-            return self._spikes(y_SRC, weight_C, bias_C, currents_4C, form)
+            return self._spikes(y_SRC, currents, form)
 
-    def _spikes(self, y_SRC: Tensor, a_C: Tensor, b_C: Tensor | None, currents_4C: Tensor, form: Form) -> Spikes:
+    def _spikes(self, y_SRC: Tensor, currents: Currents, form: Form) -> Spikes:
         if torch.is_grad_enabled():
-            return Spikes(*_Spikes.apply(y_SRC, a_C, b_C, self, currents_4C, form))  # type: ignore[no-untyped-call]
-        return self._fired(y_SRC, currents_4C, form)
+            return Spikes(*_Spikes.apply(y_SRC, *currents[:2], self, currents, form))  # type: ignore[no-untyped-call]
+        return self._as_spikes(y_SRC, self.fire(y_SRC, currents, form)[0], form)
 
-    def _fired(self, y_SRC: Tensor, currents_4C: Tensor, form: Form) -> Spikes:
-        spikes = self.fire(y_SRC, currents_4C, form)
+    def _as_spikes(self, y_SRC: Tensor, spikes: Tensor, form: Form) -> Spikes:
         if form != "bits":
             return Spikes(spikes)
         return Spikes(_NOTHING[y_SRC.dtype].expand(self.timesteps, *y_SRC.shape[1:]), spikes)
 
-    def fire(self, y_SRC: Tensor, currents_4C: Tensor, form: Form) -> Tensor:
-        """Spikes without gradient; the first two rows of ``currents`` are scale and shift.
+    def fire(self, y_SRC: Tensor, currents: Currents, form: Form) -> tuple[Tensor, Tensor]:
+        """Spikes without gradient; and the currents' scale, shift, mean and inverse deviation ``[4, C]``.
 
         Raises:
-            ValueError: ``y`` is not contiguous float32 or bfloat16 of 1 or T steps.
+            ValueError: ``y`` is not contiguous float32 or bfloat16 of 1 or T steps; see :meth:`Currents.places`.
         """
         steps, rows, channels = y_SRC.shape
         if not y_SRC.is_contiguous() or steps not in (1, self.timesteps):
@@ -130,7 +150,9 @@ class Neurons:
                 f"{y_SRC.dtype} {tuple(y_SRC.shape)} with strides {y_SRC.stride()}, expected contiguous currents of 1 "
                 f"or {self.timesteps} steps"
             )
-        what = (ctypes.addressof(self._neuron), *typed(y_SRC), _step(y_SRC), currents_4C.data_ptr())
+        currents_4C, places = torch.empty(4, channels), currents.places(channels)
+        what = (ctypes.addressof(self._neuron), *typed(y_SRC), _step(y_SRC), *places, currents.epsilon)
+        what += (currents_4C.data_ptr(),)
         sizes = (self.timesteps, rows, channels, torch.get_num_threads())
         if form == "bits":
             spikes = torch.empty(self.timesteps, rows, -(-channels // 32), dtype=torch.int32)
@@ -142,7 +164,7 @@ class Neurons:
             dtype = torch.float32 if form == "floats" else y_SRC.dtype
             spikes = torch.empty(self.timesteps, rows, channels, dtype=dtype)
             library().snn_fire(*what, *typed(spikes), *sizes)
-        return spikes
+        return spikes, currents_4C
 
     def unfire(self, y_SRC: Tensor, currents_4C: Tensor, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients of ``y``, and ``[2, C]`` of gain (or weight) and bias."""
@@ -167,31 +189,6 @@ class Neurons:
             torch.get_num_threads(),
         )
         return grad_y_SRC, grad_2C
-
-
-def _currents(
-    y_SRC: Tensor,
-    a_C: Tensor,
-    b_C: Tensor | None = None,
-    moments: tuple[Tensor, Tensor] | None = None,
-    epsilon: float = 0.0,
-) -> Tensor:
-    """How currents come from synaptic products, ``[4, C]``: scale, shift, mean and inverse deviation.
-
-    Raises:
-        ValueError: something is not contiguous float32 for every channel.
-    """
-    channels = y_SRC.shape[-1]
-    given = (a_C, b_C, *(moments or (None, None)))
-    for numbers_C in given:
-        if numbers_C is None:
-            continue
-        if numbers_C.dtype != torch.float32 or numbers_C.shape != (channels,) or not numbers_C.is_contiguous():
-            raise ValueError(f"{numbers_C.dtype} {tuple(numbers_C.shape)}, expected float32 for {channels} channels")
-    currents_4C = torch.empty(4, channels)
-    places = (None if numbers_C is None else numbers_C.data_ptr() for numbers_C in given)
-    library().snn_currents(*places, epsilon, currents_4C.data_ptr(), channels)
-    return currents_4C
 
 
 def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,12 +223,13 @@ class _Spikes(torch.autograd.Function):
         _: Tensor,
         b_C: Tensor | None,
         neurons: Neurons,
-        currents_4C: Tensor,
+        currents: Currents,
         form: Form,
     ) -> tuple[Tensor, Tensor | None]:
+        spikes, currents_4C = neurons.fire(y_SRC, currents, form)
         ctx.save_for_backward(y_SRC, currents_4C)
         ctx.neurons, ctx.has_bias, ctx.is_mean = neurons, b_C is not None, form == "mean"
-        return neurons._fired(y_SRC, currents_4C, form)
+        return neurons._as_spikes(y_SRC, spikes, form)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:

@@ -36,10 +36,9 @@ _FLAGS = (
 )
 _KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_long, "f": ctypes.c_float}
 _ARGUMENTS = {
-    "snn_currents": "ppppfpl",
-    "snn_fire": "ppilppillli",
-    "snn_fire_bits": "ppilppllli",
-    "snn_fire_mean": "ppilppllli",
+    "snn_fire": "ppilppppfppillli",
+    "snn_fire_bits": "ppilppppfppllli",
+    "snn_fire_mean": "ppilppppfppllli",
     "snn_unfire": "ppilppilpppllli",
     "snn_moments": "pipplli",
     "snn_images": "pfpillli",
