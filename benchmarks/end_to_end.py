@@ -56,7 +56,7 @@ def plain_loop(steps: int) -> Iterator[None]:
         chosen = rng.integers(0, held, BATCH)
         return Batch(stacks[0, chosen], actions[chosen], rewards[chosen], stacks[1, chosen], terminals[chosen])
 
-    update = PeerUpdate(network, sample(1), False, "cpu")
+    update = PeerUpdate(network, sample(1), False, "cpu", fused_adam=False)
     observation, _ = env.reset(seed=0)
     for step in range(steps):
         action = int(rng.integers(ACTIONS))
@@ -69,7 +69,7 @@ def plain_loop(steps: int) -> Iterator[None]:
         actions[step], rewards[step], terminals[step] = action, float(reward), terminated
         observation = env.reset()[0] if terminated or truncated else following
         if step >= WARM_UP and step % UPDATE_EVERY == 0:
-            update.load(sample(step))
+            update.batch = sample(step)
             update()
         yield
     env.close()

@@ -56,18 +56,12 @@ PLAIN = "plain loop over snn.Leaky"
 class PeerUpdate:
     """The same double-DQN step around somebody else's network; call it for one step on the batch that it holds."""
 
-    def __init__(self, network: nn.Module, batch: Batch, bf16: bool, device: str) -> None:
+    def __init__(self, network: nn.Module, batch: Batch, bf16: bool, device: str, fused_adam: bool = True) -> None:
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).eval()
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=1e-4, fused=True)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=1e-4, fused=True if fused_adam else None)
         self.bf16, self.device = bf16, device
-        self.load(batch)
-
-    def load(self, batch: Batch) -> None:
-        """Take the next batch."""
-        tensors = (torch.as_tensor(getattr(batch, field.name)).to(self.device) for field in fields(Batch))
-        x, actions, self.rewards, x_next, self.terminated = tensors
-        self.x, self.x_next, self.actions = x.float() / 255, x_next.float() / 255, actions[:, None]
+        self.batch = batch
 
     def q(self, module: nn.Module, inputs: Tensor) -> Tensor:
         """Q-values, under autocast if asked for."""
@@ -75,13 +69,16 @@ class PeerUpdate:
             return module(inputs).float()  # type: ignore[no-any-return]
 
     def __call__(self) -> None:
+        tensors = (torch.as_tensor(getattr(self.batch, field.name)).to(self.device) for field in fields(Batch))
+        x, actions, rewards, x_next, terminated = tensors
+        x, x_next = x.float() / 255, x_next.float() / 255
         with torch.no_grad():
             self.network.eval()
-            chosen = self.q(self.network, self.x_next).argmax(1, keepdim=True)
-            value = self.q(self.target, self.x_next).gather(1, chosen).squeeze(1)
-            goal = self.rewards + 0.99 * value * ~self.terminated
+            chosen = self.q(self.network, x_next).argmax(1, keepdim=True)
+            value = self.q(self.target, x_next).gather(1, chosen).squeeze(1)
+            goal = rewards + 0.99 * value * ~terminated
         self.network.train()
-        loss = F.mse_loss(self.q(self.network, self.x).gather(1, self.actions).squeeze(1), goal)
+        loss = F.mse_loss(self.q(self.network, x).gather(1, actions[:, None]).squeeze(1), goal)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
@@ -124,7 +121,9 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
         batch = replace(batch, observations=x, next_observations=x_next)
     torch.manual_seed(0)
     gflops = {name: matmul_gflops(getattr(torch, name), device) for name in ("float32", "bfloat16")}
-    steps: dict[str, Callable[[], None]] = {PLAIN: PeerUpdate(PlainLoop(timesteps), batch, False, device)}
+    steps: dict[str, Callable[[], None]] = {
+        PLAIN: PeerUpdate(PlainLoop(timesteps), batch, False, device, fused_adam=False)
+    }
     limits, precisions = {}, {PLAIN: "float32"}
     if importlib.util.find_spec("spikingjelly"):
         network = spikingjelly_network(timesteps)

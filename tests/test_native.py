@@ -15,6 +15,7 @@ from torch import Tensor
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning import machine
+from switchmt_snn.learning.native_adam import NativeAdam
 from switchmt_snn.spiking import native_library
 from switchmt_snn.spiking.native import Neurons, batch_moments, scaled_images
 from switchmt_snn.spiking.native_network import NativeNetwork
@@ -187,17 +188,63 @@ def test_a_target_is_read_anew_after_its_copy() -> None:
     before = native.weights(1)
     assert native.weights(1) is before
     assert native.weights(0).synapses is before.synapses
+    gain_N = before.gain_N.clone()
     target.load_state_dict(network.state_dict())
     learning = NativeNetwork(network, torch.bfloat16)
     after, fresh = native.weights(1), learning.weights(1)
-    assert not torch.equal(after.gain_N, before.gain_N)
+    assert not torch.equal(after.gain_N, gain_N)
     assert torch.equal(after.gain_N, fresh.gain_N)
     assert not torch.equal(after.gain_N, native.weights(0).gain_N)
     for name, synapses in fresh.synapses.items():
-        assert not torch.equal(after.synapses[name].weight, before.synapses[name].weight)
         for part in ("weight", "bias", "matrix"):
             assert torch.equal(getattr(after.synapses[name], part), getattr(synapses, part))
     assert learning.weights(1) is not fresh
+
+
+@builds
+@pytest.mark.parametrize("precision", [None, torch.bfloat16])
+def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dtype | None) -> None:
+    spec = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
+    ours, theirs = (build_network(small_config(network={"trunk": "minatar"}).network, spec, 1) for _ in range(2))
+    native = NativeNetwork(ours, precision)
+    optimizers = (
+        NativeAdam(ours.parameters(), 1e-2, 1e-5, native),
+        torch.optim.Adam(theirs.parameters(), lr=1e-2, eps=1e-5, fused=True),
+    )
+    for number in range(5):
+        native.weights(0)
+        for index, (our, their) in enumerate(zip(ours.parameters(), theirs.parameters(), strict=True)):
+            grad = torch.randn(our.shape) * 10.0 ** (-index)
+            grad = grad.contiguous(memory_format=torch.channels_last) if our.dim() == 4 and number % 2 else grad
+            our.grad, their.grad = (
+                (None, None) if index == number else (grad, grad.clone(memory_format=torch.contiguous_format))
+            )
+        before = [parameter._version for parameter in ours.parameters()]
+        for optimizer in optimizers:
+            optimizer.step()
+        moved = [parameter._version > old for parameter, old in zip(ours.parameters(), before, strict=True)]
+        assert moved.count(False) == 1
+        assert len(native.copies()) == 2
+        for weight, copy in native.copies().items():
+            assert torch.equal(copy, weight.to(copy.dtype))
+    our_state, their_state = (optimizer.state_dict()["state"] for optimizer in optimizers)
+    assert our_state.keys() == their_state.keys()
+    for (name, our), their in zip(ours.named_parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(our, their, rtol=1e-5, atol=1e-7, msg=name)
+    for index, our in our_state.items():
+        assert our.keys() == their_state[index].keys()
+        for key in our:
+            their_part = their_state[index][key]
+            torch.testing.assert_close(our[key], their_part, rtol=1e-5, atol=1e-6 * float(their_part.abs().max()))
+    with torch.no_grad():
+        next(iter(native.copies())).add_(1.0)
+    assert native.copies() == {}
+    optimizers[0].step()
+    assert native.copies() == {}
+    native.weights(0)
+    assert all(torch.equal(copy, weight.to(copy.dtype)) for weight, copy in native.copies().items())
+    with pytest.raises(ValueError, match="closure"):
+        optimizers[0].step(lambda: 0.0)
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def make_evaluate(
         ValueError: the native engine has no code for a setting of the network.
     """
     if engine == "native":
-        return _evaluate_natively(network, target, precision, double_q)
+        return NativeEvaluate(network, target, precision, double_q)
     random = network.encoder.is_random
     trained: _Forward = _Replica(network, precision)
     if group is not None:
@@ -94,20 +94,23 @@ def make_evaluate(
     return evaluate
 
 
-def _evaluate_natively(network: QNetwork, target: QNetwork, precision: torch.dtype | None, double_q: bool) -> Evaluate:
-    ours, theirs = NativeNetwork(network, precision), NativeNetwork(target, precision)
+class NativeEvaluate:
+    """The passes through native networks; see :data:`Evaluate`."""
 
-    def evaluate(observation: Tensor, following: Tensor, task: int, generator: torch.Generator) -> Values:
-        x_next = theirs.inputs(following, generator)
+    def __init__(self, network: QNetwork, target: QNetwork, precision: torch.dtype | None, double_q: bool) -> None:
+        self.network, self.target = NativeNetwork(network, precision), NativeNetwork(target, precision)
+        self._is_random, self._double_q = network.encoder.is_random, double_q
+
+    def __call__(self, observation: Tensor, following: Tensor, task: int, generator: torch.Generator) -> Values:
+        network, target = self.network, self.target
+        x_next = target.inputs(following, generator)
         with torch.no_grad():
-            (next_BA,) = theirs.decide(x_next, theirs.weights(task), training=False)
-        if double_q and network.encoder.is_random:
-            x_next = ours.inputs(following, generator)
-        x, beside = ours.inputs(observation, generator), [x_next] if double_q else []
-        q_BA, *choice = ours.decide(x, ours.weights(task), training=True, beside=beside)
+            (next_BA,) = target.decide(x_next, target.weights(task), training=False)
+        if self._double_q and self._is_random:
+            x_next = network.inputs(following, generator)
+        x, beside = network.inputs(observation, generator), [x_next] if self._double_q else []
+        q_BA, *choice = network.decide(x, network.weights(task), training=True, beside=beside)
         return Values(q_BA, next_BA, *(choice or [next_BA]))
-
-    return evaluate
 
 
 class _Replica(nn.Module):

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from switchmt_snn.config import LearningConfig
 from switchmt_snn.learning.device_frames import to_device
-from switchmt_snn.learning.engine import make_evaluate
+from switchmt_snn.learning.engine import NativeEvaluate, make_evaluate
 from switchmt_snn.learning.graph import DeviceBatch, GraphedStep, Step
+from switchmt_snn.learning.native_adam import NativeAdam
 from switchmt_snn.learning.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.state import Stateful
@@ -81,13 +82,7 @@ class Learner(Stateful):
         precision = torch.bfloat16 if config.precision == "bfloat16" else None
         self._group = group
         self._evaluate = make_evaluate(self.network, self.target, config.engine, precision, config.double_q, group)
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(),
-            lr=config.learning_rate,
-            eps=config.adam_epsilon,
-            fused=True,
-            capturable=config.engine == "graph",
-        )
+        self.optimizer = self._make_optimizer()
         self.generator = torch.Generator(device).manual_seed(seed)
         self._step = self._make_step()
         self.updates = 0
@@ -110,6 +105,15 @@ class Learner(Stateful):
             self._group.announce(UPDATE, task)
             batch = self._group.deal(batch)
         self._gradient_step(batch, task)
+
+    def _make_optimizer(self) -> torch.optim.Adam:
+        config, parameters = self.config, self.network.parameters()
+        if isinstance(self._evaluate, NativeEvaluate):
+            return NativeAdam(parameters, config.learning_rate, config.adam_epsilon, self._evaluate.network)
+        is_graph = config.engine == "graph"
+        return torch.optim.Adam(
+            parameters, lr=config.learning_rate, eps=config.adam_epsilon, fused=True, capturable=is_graph
+        )
 
     def _make_step(self) -> Step:
         if self.config.engine == "graph":

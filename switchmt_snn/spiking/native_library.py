@@ -21,7 +21,8 @@ from torch import Tensor
 
 _HEADER = Path(__file__).with_name("native_numbers.h")
 _SOURCES = tuple(
-    Path(__file__).with_name(name) for name in ("native.cpp", "native_products.cpp", "native_bfloat16.cpp")
+    Path(__file__).with_name(name)
+    for name in ("native.cpp", "native_products.cpp", "native_bfloat16.cpp", "native_adam.cpp")
 )
 # No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
 _FLAGS = (
@@ -34,7 +35,7 @@ _FLAGS = (
     "-fopenmp",
     "-fPIC",
 )
-_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_long, "f": ctypes.c_float}
+_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_long, "f": ctypes.c_float, "d": ctypes.c_double}
 _ARGUMENTS = {
     "snn_fire": "ppilppppfppillli",
     "snn_fire_bits": "ppilppppfppllli",
@@ -42,8 +43,9 @@ _ARGUMENTS = {
     "snn_unfire": "ppilppilpppllli",
     "snn_moments": "pipplli",
     "snn_images": "pfpillli",
+    "snn_adam": "plddddi",
 }
-"""Pointers, ints, longs and floats that the functions take."""
+"""Pointers, ints, longs, floats and doubles that the functions take."""
 # Those that are there if ``snn_has_products`` or ``snn_has_bfloat16`` says so.
 _PRODUCTS = {
     "snn_windows": "pplllllli",

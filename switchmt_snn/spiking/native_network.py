@@ -47,7 +47,17 @@ class NativeNetwork:
         self._dtype = torch.float32 if precision is None else precision
         self._form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
         self._neurons = Neurons(network.config)
-        self._version = -1
+        layers = {name: [layer] for name, layer in network.trunk.items()} | {_STREAMS: [*network.streams.values()]}
+        self._layers = {name: _modules(owners) for name, owners in layers.items()}
+        self._matrices: dict[str, Tensor] = {}
+        self._copies: dict[Tensor, Tensor] = {}
+        for name, modules in self._layers.items():
+            if all(isinstance(module, nn.Linear) for module in modules):
+                weights = [module.weight for module in modules]
+                sizes = [len(weight) for weight in weights]
+                self._matrices[name] = torch.empty(sum(sizes), weights[0].shape[1], dtype=self._dtype)
+                self._copies |= dict(zip(weights, self._matrices[name].split(sizes), strict=True))
+        self._copied_version = self._version = -1
         self._synapses: dict[str, Synapses] = {}
         self._by_task: dict[int, Weights] = {}
 
@@ -60,19 +70,44 @@ class NativeNetwork:
         x = network.encode(observation, generator).to(self._dtype)
         return x.movedim(2, -1).contiguous()
 
+    def copies(self) -> dict[Tensor, Tensor]:
+        """The copies of weights that products read, by parameter; none if they are not those of the parameters as they
+        are now. Who changes parameters may change all their copies as well, and say so (:meth:`copies_are_true`); else
+        :meth:`weights` makes them anew."""
+        return self._copies if self._version_now() == self._copied_version else {}
+
+    def copies_are_true(self) -> None:
+        """All copies are those of the parameters as they are now."""
+        self._copied_version = self._version_now()
+
+    def _version_now(self) -> int:
+        return sum(parameter._version for parameter in self._parameters)
+
     def weights(self, task: int) -> Weights:
         """For a task, as they are now; those of a network without gradients are kept until they change."""
-        version = sum(parameter._version for parameter in self._parameters)
+        version = self._version_now()
         if version != self._version or any(parameter.requires_grad for parameter in self._parameters):
-            layers = {name: [layer] for name, layer in self._network.trunk.items()}
-            layers[_STREAMS] = [*self._network.streams.values()]
-            self._synapses = {name: Synapses.of(_modules(owners), self._dtype) for name, owners in layers.items()}
+            self._synapses = self._read_synapses(version)
             self._version, self._by_task = version, {}
         if task not in self._by_task:
             context = self._network.context(task)
             gains = [_gains(cast(Stream, stream), context[name]) for name, stream in self._network.streams.items()]
             self._by_task[task] = Weights(self._synapses, torch.cat(gains), context)
         return self._by_task[task]
+
+    def _read_synapses(self, version: int) -> dict[str, Synapses]:
+        if version != self._copied_version:
+            with torch.no_grad():
+                for parameter, copy in self._copies.items():
+                    copy.copy_(parameter)
+            self._copied_version = version
+        synapses = {}
+        for name, modules in self._layers.items():
+            if name in self._matrices:
+                synapses[name] = Synapses.of_linear(cast(list[nn.Linear], modules), self._matrices[name])
+            else:
+                synapses[name] = Synapses.of_convolution(cast(nn.Conv2d, modules[0]), self._dtype)
+        return synapses
 
     def decide(self, x: Tensor, weights: Weights, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
         """Q-values ``[B, A]`` of :meth:`inputs`, normalised as ``training`` says; and after them those of other inputs,

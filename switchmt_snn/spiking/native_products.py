@@ -46,18 +46,17 @@ class Synapses(NamedTuple):
     stride: int
 
     @classmethod
-    @torch.no_grad()
-    def of(cls, layers: Sequence[nn.Linear | nn.Conv2d], dtype: torch.dtype) -> Synapses:
+    def of_convolution(cls, layer: nn.Conv2d, dtype: torch.dtype) -> Synapses:
         """As the parameters are now."""
-        parameters = tuple(cast(Tensor, part) for layer in layers for part in (layer.weight, layer.bias))
-        weights, biases = parameters[::2], parameters[1::2]
-        if isinstance(layers[0], nn.Conv2d):
-            weight = weights[0].detach().to(dtype, memory_format=torch.channels_last)
-            return cls(parameters, weight, biases[0].detach(), layers[0].stride[0])
-        weight = torch.empty(sum(part.shape[0] for part in weights), weights[0].shape[1], dtype=dtype)
-        for rows, part in zip(weight.split([part.shape[0] for part in weights]), weights, strict=True):
-            rows.copy_(part)
-        return cls(parameters, weight, torch.cat(biases), 0)
+        weight, bias = layer.weight, cast(Tensor, layer.bias)
+        rounded = weight.detach().to(dtype, memory_format=torch.channels_last)
+        return cls((weight, bias), rounded, bias.detach(), layer.stride[0])
+
+    @classmethod
+    def of_linear(cls, layers: Sequence[nn.Linear], weight: Tensor) -> Synapses:
+        """As the biases are now; ``weight`` holds the copies of all weights."""
+        parameters = tuple(part for layer in layers for part in (layer.weight, layer.bias))
+        return cls(parameters, weight, torch.cat(parameters[1::2]).detach(), 0)
 
     @property
     def matrix(self) -> Tensor:

@@ -1,0 +1,106 @@
+"""Products of numbers in C++ against PyTorch's in double precision, and what they are left to."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from switchmt_snn.spiking import native_dense, native_library
+from switchmt_snn.spiking.native_dense import (
+    channels_last,
+    convolution,
+    convolution_input_gradient,
+    convolution_weight_gradient,
+    matrix_product,
+)
+
+pytestmark = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
+has_bfloat16 = native_library.problem() is None and bool(native_library.library().snn_has_bfloat16())
+
+
+def close(ours: Tensor, exact: Tensor, rounded: bool) -> None:
+    scale = max(float(exact.abs().max()), 1.0)
+    torch.testing.assert_close(
+        ours.double(), exact, rtol=5e-3 if rounded else 1e-5, atol=scale * (4e-3 if rounded else 2e-6)
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+@settings(max_examples=60, deadline=None)
+@given(
+    images=st.integers(1, 20),
+    channels=st.sampled_from([1, 2, 3, 4, 12, 32, 64]),
+    sides=st.tuples(st.integers(4, 17), st.integers(4, 17)),
+    kernel=st.integers(1, 4),
+    stride=st.integers(1, 3),
+    outputs=st.sampled_from([2, 5, 16, 32, 64, 96]),
+    seed=st.integers(0, 2**31),
+)
+def test_convolutions_and_their_gradients(dtype, images, channels, sides, kernel, stride, outputs, seed) -> None:
+    """Also of sizes that C++ has no code for."""
+    torch.manual_seed(seed)
+    x = torch.randn(images, channels, *sides).to(dtype)
+    weight, bias = channels_last(torch.randn(outputs, channels, kernel, kernel).to(dtype)), torch.randn(outputs)
+    rounded = dtype == torch.bfloat16
+    y = convolution(x, weight, bias, stride)
+    close(y, F.conv2d(x.double(), weight.double(), bias.double(), stride), rounded)
+    assert y.permute(0, 2, 3, 1).is_contiguous()
+    grad_y = torch.randn(y.shape).to(dtype)
+    grad_x = convolution_input_gradient(grad_y, weight, stride, sides)
+    close(grad_x, torch.nn.grad.conv2d_input(x.shape, weight.double(), grad_y.double(), stride), rounded)
+    grad_weight, grad_bias = convolution_weight_gradient(x, grad_y, weight, stride)
+    exact = torch.nn.grad.conv2d_weight(x.double(), weight.shape, grad_y.double(), stride)
+    in_cplusplus = rounded and has_bfloat16 and outputs % 32 == 0 and not native_dense.has_amx()
+    close(grad_weight, exact, rounded and not in_cplusplus)
+    close(grad_bias, grad_y.double().sum((0, 2, 3)), rounded and not in_cplusplus)
+    assert grad_weight.dtype == grad_bias.dtype == torch.float32
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.integers(1, 40), inner=st.integers(1, 70), columns=st.sampled_from([1, 31, 32, 64, 160]), seed=st.integers()
+)
+def test_matrix_products(dtype, rows, inner, columns, seed) -> None:
+    torch.manual_seed(seed % 2**31)
+    a, b = torch.randn(rows, inner).to(dtype), torch.randn(columns, inner).to(dtype).T
+    close(matrix_product(a, b), a.double() @ b.double(), dtype == torch.bfloat16)
+    close(matrix_product(a, b.contiguous()), a.double() @ b.double(), dtype == torch.bfloat16)
+
+
+@pytest.mark.skipif(not has_bfloat16, reason="no AVX512-BF16")
+def test_any_number_of_threads_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native_dense, "has_amx", lambda: False)
+    x, weight = torch.randn(21, 4, 20, 20).bfloat16(), channels_last(torch.randn(32, 4, 8, 8).bfloat16())
+    grad_y, deep = torch.randn(21, 32, 4, 4).bfloat16(), channels_last(torch.randn(32, 64, 4, 4).bfloat16())
+    threads, results = torch.get_num_threads(), []
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            results.append(
+                (
+                    convolution(x, weight, torch.ones(32), 4),
+                    *convolution_weight_gradient(x, grad_y, weight, 4),
+                    convolution_input_gradient(grad_y, deep, 2, (10, 10)),
+                    matrix_product(x.flatten(1), torch.ones(1600, 96).bfloat16()),
+                )
+            )
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.skipif(not has_bfloat16, reason="no AVX512-BF16")
+def test_with_amx_products_are_pytorchs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native_dense, "has_amx", lambda: True)
+    monkeypatch.setattr(native_library.library(), "snn_matrix_product", None)
+    a, b = torch.randn(8, 32).bfloat16(), torch.randn(32, 64).bfloat16()
+    assert torch.equal(matrix_product(a, b), a @ b)
+    monkeypatch.setattr(native_dense, "has_amx", lambda: False)
+    with pytest.raises(TypeError):
+        matrix_product(a, b)
