@@ -92,6 +92,12 @@ def our_learner(config: ExperimentConfig, suite: TaskSuite, device: str) -> Lear
     return Learner(network, resolved.learning, suite.valid_actions_KA, torch.device(device), 1)
 
 
+def _update(learner: Learner, batch: Batch) -> None:
+    if learner.updates == 8:  # of the warm-up; the target's layers fire only with running statistics of the data
+        learner.copy_target()
+    learner.update(batch, 0)
+
+
 class Work(NamedTuple):
     """Operations of an update's products in 1e9, two for a multiply-accumulate."""
 
@@ -144,12 +150,9 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
                     learning=replace(base.learning, precision=precision, engine=engine),
                 )
                 learner = our_learner(config, suite, device)
-                for _ in range(8):
-                    learner.update(batch, 0)
-                learner.copy_target()  # its layers fire only with running statistics of the data
                 work[label] = Work.of(learner, batch)
                 name = f"{label}, {precision}, {engine}"
-                steps[name] = functools.partial(learner.update, batch, 0)
+                steps[name] = functools.partial(_update, learner, batch)
                 has_bits = engine == "native" and spikes_as_bits(getattr(torch, precision))
                 of_spikes = spike_product_gflops() if has_bits else gflops[precision]
                 limits[name] = 1e3 * (work[label].of_spikes / of_spikes + work[label].other / gflops[precision])

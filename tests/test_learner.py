@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,11 @@ import torch
 from switchmt_snn.learning.learner import Learner, td_target
 from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.spiking import native_library
 from switchmt_snn.spiking.network import build_network
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite
+
+builds = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
 
 
 def test_double_q_target_by_hand() -> None:
@@ -88,10 +93,11 @@ def test_rewards_are_clipped_in_the_learner_only(clip: bool, reward: float) -> N
     assert torch.equal(weights[0], weights[1])
 
 
-def test_losses_and_clipping_change_the_update() -> None:
+@pytest.mark.parametrize("engine", ["eager", pytest.param("native", marks=builds)])
+def test_losses_and_clipping_change_the_update(engine: str) -> None:
     results = set()
     for settings in ({}, {"loss": "huber"}, {"gradient_clip": "value", "gradient_clip_at": 1e-3}, {"double_q": False}):
-        part = learner(clip_rewards=False, **settings)
+        part = learner(clip_rewards=False, engine=engine, **settings)
         with torch.no_grad():  # online and target differ, so that double-Q matters
             for parameter in part.target.parameters():
                 parameter.mul_(-1.5)
@@ -99,6 +105,26 @@ def test_losses_and_clipping_change_the_update() -> None:
             part.update(batch(50.0), 0)
         results.add(part.parameters().numpy().tobytes())
     assert len(results) == 4
+
+
+@builds
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_native_updates_go_on_from_a_state_that_is_put_back(precision: str) -> None:
+    """Nothing that was kept of weights, copies or the target outlives them."""
+    part = learner(engine="native", precision=precision)
+    part.update(batch(), 0)
+    part.copy_target()
+    state, after = copy.deepcopy(part.state_dict()), []
+    for number in range(3):
+        for task in (0, 1):
+            part.update(batch(), task)
+        after.append(part.parameters())
+        if number == 1:
+            part = learner(engine="native", precision=precision)
+        part.load_state_dict(copy.deepcopy(state))
+    assert torch.equal(after[0], after[1])
+    assert torch.equal(after[0], after[2])
+    assert not torch.equal(after[0], part.parameters())
 
 
 def test_a_loss_that_is_not_finite_is_seen() -> None:

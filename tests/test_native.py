@@ -245,6 +245,12 @@ def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dty
     assert all(torch.equal(copy, weight.to(copy.dtype)) for weight, copy in native.copies().items())
     with pytest.raises(ValueError, match="closure"):
         optimizers[0].step(lambda: 0.0)
+    for optimizer, other in (optimizers, optimizers[::-1]):  # each goes on from the other's state
+        optimizer.load_state_dict(other.state_dict())
+    state = optimizers[0].state_dict()
+    state["state"][0]["exp_avg"] = state["state"][0]["exp_avg"][:1]
+    with pytest.raises(ValueError, match=r"exp_avg is .*expected that of a parameter"):
+        optimizers[0].load_state_dict(state)
 
 
 @pytest.mark.parametrize(

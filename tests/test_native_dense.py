@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -40,6 +40,9 @@ def close(ours: Tensor, exact: Tensor, rounded: bool) -> None:
     outputs=st.sampled_from([2, 5, 16, 32, 64, 96]),
     seed=st.integers(0, 2**31),
 )
+@example(images=3, channels=4, sides=(20, 24), kernel=8, stride=4, outputs=32, seed=0)  # those of the nature trunk
+@example(images=3, channels=32, sides=(20, 20), kernel=4, stride=2, outputs=64, seed=0)
+@example(images=3, channels=64, sides=(9, 9), kernel=3, stride=1, outputs=64, seed=0)
 def test_convolutions_and_their_gradients(dtype, images, channels, sides, kernel, stride, outputs, seed) -> None:
     """Also of sizes that C++ has no code for."""
     torch.manual_seed(seed)
@@ -104,3 +107,25 @@ def test_with_amx_products_are_pytorchs(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(native_dense, "has_amx", lambda: False)
     with pytest.raises(TypeError):
         matrix_product(a, b)
+
+
+@pytest.mark.skipif(not has_bfloat16, reason="no AVX512-BF16")
+def test_what_cplusplus_would_read_wrongly_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native_dense, "has_amx", lambda: False)
+    x, weight, bias = torch.zeros(2, 4, 9, 9).bfloat16(), torch.zeros(32, 4, 3, 3).bfloat16(), torch.zeros(32)
+    for wrong in (weight[:, :2], weight[..., :2], torch.zeros(32, 4, 10, 10).bfloat16()):
+        with pytest.raises(ValueError, match="expected square ones"):
+            convolution(x, wrong, bias, 1)
+    for wrong in (bias[:8], bias.double()):
+        with pytest.raises(ValueError, match="expected float32 for 32 channels"):
+            convolution(x, weight, wrong, 1)
+    grad_y = torch.zeros(2, 32, 7, 7).bfloat16()
+    for wrong in (grad_y[:1], grad_y[..., :5]):
+        with pytest.raises(ValueError, match="gradient of products"):
+            convolution_weight_gradient(x, wrong, weight, 1)
+    with pytest.raises(ValueError, match="gradient of products"):
+        convolution_input_gradient(grad_y, torch.zeros(32, 32, 3, 3).bfloat16(), 1, (8, 9))
+    with pytest.raises(ValueError, match="equal inner sizes"):
+        matrix_product(torch.zeros(4, 8).bfloat16(), torch.zeros(6, 32).bfloat16())
+    with pytest.raises(RuntimeError):  # PyTorch's own words
+        matrix_product(torch.zeros(4, 8).bfloat16(), torch.zeros(8, 32))

@@ -89,7 +89,7 @@ def _settle_engine(
         if obstacle is None and engine == "auto" and precision == "float32" and not spikes_as_bits(torch.float32):
             obstacle = "it is faster in float32 only with AVX-512"
         if obstacle is None:
-            said = "updates run natively: spikes and neurons in C++ (learning.engine=eager does without)"
+            said = "updates run natively, in C++ (learning.engine=eager does without)"
             return "native", [said] if engine == "auto" else []
         if engine == "native":
             raise unavailable("a spiking network on a CPU and a C++ compiler (g++, or what CXX names)", obstacle)

@@ -37,6 +37,19 @@ class NativeAdam(torch.optim.Adam):
         super().__init__(parameters, lr=lr, eps=eps, fused=True)
         self._network = network
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a state of this class or of :class:`torch.optim.Adam`.
+
+        Raises:
+            ValueError: its moments are not those of the parameters.
+        """
+        super().load_state_dict(state_dict)
+        for parameter, state in self.state.items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                seen, expected = ((x.dtype, tuple(x.shape), x.stride()) for x in (state[name], parameter))
+                if seen != expected:
+                    raise ValueError(f"{name} is {seen}, expected that of a parameter, {expected}")
+
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         """One step; parameters without gradient stay.

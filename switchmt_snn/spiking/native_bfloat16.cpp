@@ -167,7 +167,8 @@ void snn_input_gradient(const BFloat16* grad_y, const BFloat16* weights, BFloat1
 }
 
 // Gradients of a convolution's weights [O][kernel][kernel][C] and bias [O] from x [images][height][width][C] and grad_y
-// [images][h][w][O], O being a multiple of CHANNELS. A pair are two windows side by side.
+// [images][h][w][O], O being a multiple of CHANNELS. A pair are two windows side by side;
+// the last of an odd number has zeros beside it, so inputs are finite.
 void snn_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_weights, float* grad_bias, long images,
                          long height, long width, long C, long O, long kernel, long stride, int threads) {
     long down = (height - kernel) / stride + 1, across = (width - kernel) / stride + 1, window_pairs = (across + 1) / 2;

@@ -23,7 +23,7 @@ _STREAMS = "streams"
 
 
 class Weights(NamedTuple):
-    """A network as it is now, for one task."""
+    """A network as one task sees it, until its parameters change: the copies of weights are then written anew."""
 
     synapses: dict[str, Synapses]
     """By layer name."""
@@ -36,8 +36,8 @@ class NativeNetwork:
     """Q-values of a network that is read at every call.
 
     With ``torch.bfloat16``, weights, synaptic products and the gradients of products and inputs are rounded to it, as
-    under autocast; where spikes are bits, biases and the gradients of weights are not. All else is float32. Everything
-    is on the CPU.
+    under autocast; biases and the gradients of weights are not, except in PyTorch's products. All else is float32.
+    Everything is on the CPU. A change of parameters through ``.data`` is not seen.
     """
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:

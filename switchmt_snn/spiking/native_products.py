@@ -213,20 +213,18 @@ class _SpikeConvolution(torch.autograd.Function):
 
 
 class _SpikeLinear(torch.autograd.Function):
-    """Of several panels, whose tables are made once; the gradient is the last one's."""
+    """Of several panels, with the same tables; the gradient is the last one's."""
 
     @staticmethod
     def forward(
         ctx: Any, numbers: Tensor, synapses: Synapses, panels: Sequence[Panels], *parameters: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.synapses, ctx.panels = synapses, panels[-1]
-        weights = synapses.matrix, synapses.bias
-        lanes = [part.lanes for part in panels]
-        if any(number % _LANES for number in lanes[:-1]):
-            parts = tuple(part.times(*weights) for part in panels)
-        else:
-            words = torch.cat([part.words for part in panels])
-            parts = Panels(words, sum(lanes), panels[-1].bits).times(*weights).split(lanes)
+        ctx.set_materialize_grads(False)
+        words = torch.cat([part.words for part in panels])
+        y = Panels(words, len(words) * _LANES, panels[-1].bits).times(synapses.matrix, synapses.bias)
+        rows = y.split([len(part.words) * _LANES for part in panels])
+        parts = tuple(some[: part.lanes] for some, part in zip(rows, panels, strict=True))
         ctx.mark_non_differentiable(*parts[:-1])
         return parts
 
