@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from switchmt_snn.learning.frames import CompressedFrames, PlainFrames
 from switchmt_snn.learning.replay import BLOCK_SLOTS, SEGMENT_SLOTS, FrameReplay, Segment
 
 
@@ -227,3 +228,22 @@ def test_sampling_is_uniform_and_seeded() -> None:
 def test_nothing_to_sample() -> None:
     with pytest.raises(ValueError, match="no transition"):
         FrameReplay(10, 1, (1,), np.float32, 1).sample(2, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_many_blocks_are_read_by_several_threads(threads: int) -> None:
+    rng = np.random.default_rng(0)
+    plain, compressed = PlainFrames(2, 300, (5, 6), np.uint8), CompressedFrames(2, 300, (5, 6), np.uint8, 16)
+    for lane in (0, 1):
+        for within in range(230):
+            for frames in (plain, compressed):
+                frames.write(lane, within, np.full((5, 6), 7 * lane + within % 251, np.uint8))
+    slots = rng.integers(0, 230, (200, 4)) + 300 * rng.integers(0, 2, (200, 4))
+    slots[rng.random((200, 4)) < 0.1] = -1
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        for _ in range(5):
+            assert np.array_equal(compressed.read(slots), plain.read(slots))
+    finally:
+        torch.set_num_threads(before)

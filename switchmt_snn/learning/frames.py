@@ -6,14 +6,20 @@ written slot after slot within a lane, and both give back the same bytes.
 
 from __future__ import annotations
 
+import functools
 import itertools
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import torch
 import zstandard
 
 ZSTD_LEVEL = 3
+_FEW_BLOCKS = 8
+"""Read by one thread: another would take longer to wake."""
 _BYTES_OBJECT = 33 + 8
 """What a block takes beside its content: the head of a bytes object, and the allocator's."""
 
@@ -84,7 +90,7 @@ class CompressedFrames:
         self._open = np.full(num_lanes, -1, np.int64)
         self._open_frames = np.zeros((num_lanes, self._block_slots, self._frame_bytes), np.uint8)
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-        self._decompressor = zstandard.ZstdDecompressor()
+        self._of_thread = threading.local()  # a decompressor works on one block at a time
 
     @property
     def nbytes(self) -> int:
@@ -110,7 +116,7 @@ class CompressedFrames:
         self._store(self._block(lane, within), None)
 
     def read(self, slots: Slots) -> Frames:
-        """Frames ``[*slots.shape, *frame_shape]``; every block is decompressed once, as far as needed."""
+        """Frames ``[*slots.shape, *frame_shape]``; every block is decompressed once, on PyTorch's number of threads."""
         flat = slots.reshape(-1)
         out = np.zeros((len(flat), self._frame_bytes), np.uint8)
         lanes, within = flat // self._slots, flat % self._slots
@@ -118,13 +124,24 @@ class CompressedFrames:
         offsets = within % self._block_slots
         order = np.argsort(blocks, kind="stable")
         borders = np.flatnonzero(np.diff(blocks[order], prepend=-2, append=-2)).tolist()
-        for start, end in itertools.pairwise(borders):
-            chosen = order[start:end]
-            block = int(blocks[chosen[0]])
-            if block >= 0:
-                frames = self._frames_of(block, int(offsets[chosen].max()) + 1)
-                if frames is not None:
-                    out[chosen] = frames[offsets[chosen]]
+
+        def read_blocks(parts: list[tuple[int, int]]) -> None:
+            for start, end in parts:
+                chosen = order[start:end]
+                block = int(blocks[chosen[0]])
+                if block >= 0:
+                    frames = self._frames_of(block, int(offsets[chosen].max()) + 1)
+                    if frames is not None:
+                        out[chosen] = frames[offsets[chosen]]
+
+        parts, threads = list(itertools.pairwise(borders)), torch.get_num_threads()
+        if len(parts) <= _FEW_BLOCKS or threads == 1:
+            read_blocks(parts)
+        else:
+            others = [_pool(threads).submit(read_blocks, parts[first::threads]) for first in range(1, threads)]
+            read_blocks(parts[::threads])
+            for other in others:
+                other.result()
         return out.view(self._dtype).reshape(*slots.shape, *self._shape)
 
     def _block(self, lane: int, within: int) -> int:
@@ -145,8 +162,15 @@ class CompressedFrames:
         content = self._blocks[block]
         if content is None:
             return None
-        raw = bytearray(self._decompressor.decompress(content))
+        if not hasattr(self._of_thread, "decompressor"):
+            self._of_thread.decompressor = zstandard.ZstdDecompressor()
+        raw = bytearray(self._of_thread.decompressor.decompress(content))
         frames: npt.NDArray[np.uint8] = np.frombuffer(raw, np.uint8).reshape(-1, self._frame_bytes)
         for index in range(1, count):
             np.bitwise_xor(frames[index], frames[index - 1], out=frames[index])
         return frames
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads - 1, thread_name_prefix="frames")

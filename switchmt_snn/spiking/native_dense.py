@@ -1,6 +1,6 @@
 """Products of numbers: in bfloat16 those of ``native_bfloat16.cpp``, where the processor has AVX512-BF16 but no AMX and
-the sizes fit; else PyTorch's (oneDNN). Images have their channels innermost in memory. Sums are float32 in both; in C++,
-nothing is rounded but what is returned in bfloat16.
+the sizes fit; else PyTorch's (oneDNN). Images have their channels innermost in memory. Sums are float32 in both; what
+is returned in float32 is not rounded in C++.
 
 Shapes: I images, H, W places, C channels in, O channels out.
 """
