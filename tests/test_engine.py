@@ -24,6 +24,13 @@ from tests.conftest import small_config
 
 CPU = torch.device("cpu")
 SIDES = {"nature": 84, "minatar": 10, "mlp": 10}
+OTHER_NEURONS = {
+    "neuron": "LIF",
+    "reset": "subtract",
+    "surrogate": "fast_sigmoid",
+    "dendrites": "per_neuron",
+    "threshold": 0.2,
+}
 
 
 def minatar(**network: Any) -> ExperimentConfig:
@@ -70,13 +77,7 @@ builds = pytest.mark.skipif(native_library.problem() is not None, reason="no C++
     "network",
     [
         {},
-        {
-            "neuron": "LIF",
-            "reset": "subtract",
-            "surrogate": "fast_sigmoid",
-            "dendrites": "per_neuron",
-            "threshold": 0.2,
-        },
+        OTHER_NEURONS,
         {"encoding": "rate", "surrogate": "sigmoid", "readout": "max_membrane", "k_winners": 5},
         {"method": "DQN_D"},
     ],
@@ -91,13 +92,7 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
     "network",
     [
         {},
-        {
-            "neuron": "LIF",
-            "reset": "subtract",
-            "surrogate": "fast_sigmoid",
-            "dendrites": "per_neuron",
-            "threshold": 0.2,
-        },
+        OTHER_NEURONS,
         {"encoding": "rate", "readout": "max_membrane", "method": "DSQN_D"},
         {
             "encoding": "latency",
