@@ -231,7 +231,7 @@ def test_nothing_to_sample() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_many_blocks_are_read_by_several_threads(threads: int) -> None:
+def test_many_blocks_are_read_by_two_threads(threads: int) -> None:
     rng = np.random.default_rng(0)
     plain, compressed = PlainFrames(2, 300, (5, 6), np.uint8), CompressedFrames(2, 300, (5, 6), np.uint8, 16)
     for lane in (0, 1):

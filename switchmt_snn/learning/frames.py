@@ -116,7 +116,8 @@ class CompressedFrames:
         self._store(self._block(lane, within), None)
 
     def read(self, slots: Slots) -> Frames:
-        """Frames ``[*slots.shape, *frame_shape]``; every block is decompressed once, on PyTorch's number of threads."""
+        """Frames ``[*slots.shape, *frame_shape]``; every block is decompressed once. A second thread takes half of them
+        if PyTorch has more than one; more threads were not measured."""
         flat = slots.reshape(-1)
         out = np.zeros((len(flat), self._frame_bytes), np.uint8)
         lanes, within = flat // self._slots, flat % self._slots
@@ -134,14 +135,13 @@ class CompressedFrames:
                     if frames is not None:
                         out[chosen] = frames[offsets[chosen]]
 
-        parts, threads = list(itertools.pairwise(borders)), torch.get_num_threads()
-        if len(parts) <= _FEW_BLOCKS or threads == 1:
+        parts = list(itertools.pairwise(borders))
+        if len(parts) <= _FEW_BLOCKS or torch.get_num_threads() == 1:
             read_blocks(parts)
         else:
-            others = [_pool(threads).submit(read_blocks, parts[first::threads]) for first in range(1, threads)]
-            read_blocks(parts[::threads])
-            for other in others:
-                other.result()
+            other_half = _second_thread().submit(read_blocks, parts[1::2])
+            read_blocks(parts[::2])
+            other_half.result()
         return out.view(self._dtype).reshape(*slots.shape, *self._shape)
 
     def _block(self, lane: int, within: int) -> int:
@@ -172,5 +172,5 @@ class CompressedFrames:
 
 
 @functools.cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads - 1, thread_name_prefix="frames")
+def _second_thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="frames")

@@ -1,5 +1,5 @@
-"""The C++ sources beside this file as a library: compiled by the machine's C++ compiler at its first use, for
-the processor at hand, kept in the user's cache, and loaded. Its parallel loops run in PyTorch's own pool of threads.
+"""The C++ sources beside this file as a library: compiled by the machine's C++ compiler at its first use, for the
+processor at hand, kept in the user's cache, and loaded. Its parallel loops run in PyTorch's own pool of threads.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _ARGUMENTS = {
     "snn_adam": "plddddi",
 }
 """Pointers, ints, longs, floats and doubles that the functions take."""
-# Those that are there if ``snn_has_products`` or ``snn_has_bfloat16`` says so.
+# The next two are there if ``snn_has_products`` and ``snn_has_bfloat16`` say so.
 _PRODUCTS = {
     "snn_windows": "pplllllli",
     "snn_flat": "ppllli",

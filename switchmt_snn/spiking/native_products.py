@@ -1,5 +1,5 @@
 """Synaptic products with their gradients. Those of spikes that are kept as bits are float32 sums of weights
-(``native_products.cpp``, AVX-512), at several times the speed of multiplications; all others are of numbers
+(``native_products.cpp``, AVX-512), at some three times the speed of float32 multiplications; all others are of numbers
 (:mod:`~switchmt_snn.spiking.native_dense`).
 
 Shapes: T steps, B batch, I = T * B images, H, W places, C channels in, O channels out, K inputs of an output.
