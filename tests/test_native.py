@@ -17,7 +17,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning import machine
 from switchmt_snn.learning.native_adam import NativeAdam
 from switchmt_snn.spiking import native_library
-from switchmt_snn.spiking.native import Neurons, batch_moments, scaled_images
+from switchmt_snn.spiking.native import Currents, Neurons, batch_moments, scaled_images
 from switchmt_snn.spiking.native_network import NativeNetwork
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.spiking.neurons import SpikingLayer
@@ -57,15 +57,15 @@ def test_spikes_are_bitwise_those_of_the_eager_neurons(form, timesteps, shared, 
     config = NetworkConfig(timesteps=timesteps, **form)
     torch.manual_seed(seed)
     y = (torch.randn(1 if shared else timesteps, rows, channels) * 1.5).to(torch.bfloat16 if low else torch.float32)
-    weights, results = torch.randn(timesteps, rows, channels), []
-    for run in (Neurons(config).gated, None):
-        y_SRC, gain_C = y.clone().requires_grad_(), torch.linspace(0.3, 1.2, channels).requires_grad_()
-        spikes = plain_gated(config, y_SRC, gain_C) if run is None else run(y_SRC, gain_C, "floats").numbers
-        (spikes * weights).sum().backward()
-        results.append((spikes, y_SRC.grad, gain_C.grad))
-    (ours, *our_grads), (theirs, *their_grads) = results
+    weights, gain = torch.randn(timesteps, rows, channels), torch.linspace(0.3, 1.2, channels)
+    y_SRC, gain_C = y.clone().requires_grad_(), gain.clone().requires_grad_()
+    theirs = plain_gated(config, y_SRC, gain_C)
+    (theirs * weights).sum().backward()
+    neurons = Neurons(config)
+    ours, currents_4C = neurons.fire(y, Currents(gain), "floats")
+    grad_y, (grad_gain, _) = neurons.unfire(y, currents_4C, weights)
     assert torch.equal(ours, theirs)
-    for our_grad, their_grad in zip(our_grads, their_grads, strict=True):
+    for our_grad, their_grad in ((grad_y, y_SRC.grad), (grad_gain, gain_C.grad)):
         scale = float(their_grad.abs().max()) + 1e-6
         torch.testing.assert_close(
             our_grad, their_grad, rtol=1e-2 if low else 1e-4, atol=scale * (5e-3 if low else 1e-5)
@@ -75,25 +75,15 @@ def test_spikes_are_bitwise_those_of_the_eager_neurons(form, timesteps, shared, 
 @builds
 @pytest.mark.parametrize("channels", [5, 16, 32, 47, 80])
 def test_every_form_has_the_same_spikes(channels: int) -> None:
-    """Numbers, floats, bits (no bit beyond the channels), mean; and the mean's gradient."""
-    neurons = Neurons(NetworkConfig(timesteps=3))
-    y, ones, g = (torch.randn(3, 21, channels) * 2).bfloat16(), torch.ones(channels), torch.randn(1, 21, channels)
-    floats = neurons.gated(y, ones, "floats").numbers
+    """Numbers, floats, bits (no bit beyond the channels), mean."""
+    neurons, currents = Neurons(NetworkConfig(timesteps=3)), Currents(torch.ones(channels))
+    y = (torch.randn(3, 21, channels) * 2).bfloat16()
+    floats, _ = neurons.fire(y, currents, "floats")
     assert 0.1 < floats.mean() < 0.9
-    assert torch.equal(neurons.gated(y, ones, "numbers").numbers, floats.bfloat16())
-    spikes = neurons.gated(y, ones, "bits")
-    assert spikes.bits is not None
-    unpacked = (spikes.bits[..., None] >> torch.arange(32)) & 1
+    assert torch.equal(neurons.fire(y, currents, "numbers")[0], floats.bfloat16())
+    unpacked = (neurons.fire(y, currents, "bits")[0][..., None] >> torch.arange(32)) & 1
     assert torch.equal(unpacked.flatten(2), F.pad(floats, (0, -channels % 32)).int())
-    grads = []
-    for form in ("mean", "floats"):
-        y_SRC = y.clone().requires_grad_()
-        numbers = neurons.gated(y_SRC, ones, form).numbers  # type: ignore[arg-type]
-        mean = numbers.mean(0, keepdim=True)
-        (mean * g).sum().backward()
-        grads.append((mean, y_SRC.grad))
-    assert torch.equal(grads[0][0], grads[1][0])
-    assert torch.equal(grads[0][1], grads[1][1])
+    assert torch.equal(neurons.fire(y, currents, "mean")[0], floats.mean(0, keepdim=True))
 
 
 @builds
@@ -105,34 +95,47 @@ def test_normalized_spikes_equal_batch_norm_and_neurons(dtype: torch.dtype, step
     torch.manual_seed(3)
     y, g = (torch.randn(steps, 400, 24) * 3 + 5).to(dtype), torch.randn(4, 400, 24)
     weight, bias = torch.rand(24) + 0.5, torch.randn(24) / 3
-    results = []
-    for is_native in (True, False):
-        y_SRC, weight_C, bias_C = (x.clone().requires_grad_() for x in (y, weight, bias))
-        if is_native:
-            mean_C, var_C = batch_moments(y_SRC.detach())
-            of = (y_SRC, weight_C, bias_C, (mean_C, var_C), 1e-5)
-            spikes = Neurons(config).normalized(*of, of_batch=True, form="numbers").numbers
-        else:
-            flat = y_SRC.flatten(0, 1).to(torch.float64)
-            current = F.batch_norm(flat, None, None, weight_C.double(), bias_C.double(), True, 0.1, 1e-5)
-            current = current.float().view(steps, 400, 24).expand(4, 400, 24)
-            spikes, _ = SpikingLayer(config)(current)
-        (spikes.float() * g.to(dtype).float()).sum().backward()
-        results.append((spikes.float(), y_SRC.grad, weight_C.grad, bias_C.grad))
-    assert results[0][0].mean() > 0.1
-    assert torch.equal(results[0][0], results[1][0])
-    for ours, theirs in zip(results[0][1:], results[1][1:], strict=True):
-        scale = float(theirs.abs().max())
-        low = dtype == torch.bfloat16
-        torch.testing.assert_close(ours, theirs, rtol=1e-2 if low else 1e-4, atol=scale * (1e-2 if low else 1e-5))
+    y_SRC, weight_C, bias_C = (x.clone().requires_grad_() for x in (y, weight, bias))
+    flat = y_SRC.flatten(0, 1).to(torch.float64)
+    current = F.batch_norm(flat, None, None, weight_C.double(), bias_C.double(), True, 0.1, 1e-5)
+    current = current.float().view(steps, 400, 24).expand(4, 400, 24)
+    spikes, _ = SpikingLayer(config)(current)
+    (spikes * g.to(dtype).float()).sum().backward()
+    neurons = Neurons(config)
+    ours, currents_4C = neurons.fire(y, Currents(weight, bias, *batch_moments(y), 1e-5), "numbers")
+    grad_y, (grad_weight, grad_bias) = neurons.unfire(y, currents_4C, g.to(dtype))
+    assert ours.mean() > 0.1
+    assert torch.equal(ours.float(), spikes)
+    low = dtype == torch.bfloat16
+    for our_grad, part in ((grad_y, y_SRC), (grad_weight, weight_C), (grad_bias, bias_C)):
+        assert part.grad is not None
+        scale = float(part.grad.abs().max())
+        torch.testing.assert_close(
+            our_grad, part.grad, rtol=1e-2 if low else 1e-4, atol=scale * (1e-2 if low else 1e-5)
+        )
 
 
 @builds
-def test_moments_keep_their_digits_far_from_zero() -> None:
-    y = torch.randn(2, 5000, 40) + 300.0
+@pytest.mark.parametrize(("mean", "first"), [(300.0, 300.0), (-1e4, -1e4), (0.0, 1000.0)])
+def test_moments_keep_their_digits(mean: float, first: float) -> None:
+    """Far from zero, and beside a value that is far from all others."""
+    y = torch.randn(2, 5000, 40) + mean
+    y[0, 0] = first
     mean_C, var_C = batch_moments(y)
-    torch.testing.assert_close(mean_C.double(), y.double().mean((0, 1)), rtol=1e-6, atol=0)
+    torch.testing.assert_close(mean_C.double(), y.double().mean((0, 1)), rtol=1e-6, atol=1e-7 * abs(first))
     torch.testing.assert_close(var_C.double(), y.double().var((0, 1), correction=0), rtol=1e-5, atol=0)
+
+
+@builds
+@pytest.mark.parametrize(("steps", "rows"), [(1, 2), (1, 63), (4, 150)])
+def test_running_moments_move_as_in_batch_norm(steps: int, rows: int) -> None:
+    y, (mean_C, var_C) = torch.randn(steps, rows, 37) * 3 + 2, (torch.randn(37), torch.rand(37))
+    theirs = mean_C.clone(), var_C.clone()
+    F.batch_norm(y.flatten(0, 1), *theirs, training=True, momentum=0.3)
+    batch_moments(y, (mean_C, var_C), 0.3)
+    torch.testing.assert_close((mean_C, var_C), theirs, rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match="expected float32 for 37 channels"):
+        batch_moments(y, (mean_C.double(), var_C), 0.3)
 
 
 @builds
@@ -155,23 +158,22 @@ def test_what_cplusplus_would_read_wrongly_is_refused() -> None:
         torch.zeros(4, 5, 8, device="meta"),
     ):
         with pytest.raises(ValueError, match="expected"):
-            neurons.gated(y, ones, "floats")
+            neurons.fire(y, Currents(ones), "floats")
     for gain_C in (ones.double(), torch.ones(1)):
         with pytest.raises(ValueError, match="expected float32 for 8 channels"):
-            neurons.gated(torch.zeros(4, 5, 8), gain_C, "floats")
+            neurons.fire(torch.zeros(4, 5, 8), Currents(gain_C), "floats")
 
 
 @builds
 def test_any_number_of_threads_gives_the_same_bits() -> None:
-    config = NetworkConfig(timesteps=4)
+    neurons, currents = Neurons(NetworkConfig(timesteps=4)), Currents(torch.ones(48))
     y, g = torch.randn(4, 333, 48), torch.randn(4, 333, 48)
     threads, results = torch.get_num_threads(), []
     try:
         for number in (1, 2, 3):
             torch.set_num_threads(number)
-            y_SRC, gain_C = y.clone().requires_grad_(), torch.ones(48, requires_grad=True)
-            (Neurons(config).gated(y_SRC, gain_C, "floats").numbers * g).sum().backward()
-            results.append((y_SRC.grad, gain_C.grad, *batch_moments(y)))
+            spikes, currents_4C = neurons.fire(y, currents, "floats")
+            results.append((spikes, *neurons.unfire(y, currents_4C, g), *batch_moments(y)))
     finally:
         torch.set_num_threads(threads)
     for other in results[1:]:
@@ -187,7 +189,6 @@ def test_a_target_is_read_anew_after_its_copy() -> None:
     native = NativeNetwork(target, torch.bfloat16)
     before = native.weights(1)
     assert native.weights(1) is before
-    assert native.weights(0).synapses is before.synapses
     gain_N = before.gain_N.clone()
     target.load_state_dict(network.state_dict())
     learning = NativeNetwork(network, torch.bfloat16)
@@ -195,10 +196,10 @@ def test_a_target_is_read_anew_after_its_copy() -> None:
     assert not torch.equal(after.gain_N, gain_N)
     assert torch.equal(after.gain_N, fresh.gain_N)
     assert not torch.equal(after.gain_N, native.weights(0).gain_N)
-    for name, synapses in fresh.synapses.items():
-        for part in ("weight", "bias", "matrix"):
-            assert torch.equal(getattr(after.synapses[name], part), getattr(synapses, part))
-    assert learning.weights(1) is not fresh
+    assert len(native.copies) == 5  # a convolution's weight, two streams' weights and biases
+    for ours, theirs in zip(native.copies.items(), learning.copies.items(), strict=True):
+        assert torch.equal(ours[0], theirs[0])
+        assert torch.equal(ours[1], theirs[1])
 
 
 @builds
@@ -224,9 +225,9 @@ def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dty
             optimizer.step()
         moved = [parameter._version > old for parameter, old in zip(ours.parameters(), before, strict=True)]
         assert moved.count(False) == 1
-        assert len(native.copies()) == 2
-        for weight, copy in native.copies().items():
-            assert torch.equal(copy, weight.to(copy.dtype))
+        assert native.copies_are_true()
+        for part, copy in native.copies.items():
+            assert torch.equal(copy, part.to(copy.dtype))
     our_state, their_state = (optimizer.state_dict()["state"] for optimizer in optimizers)
     assert our_state.keys() == their_state.keys()
     for (name, our), their in zip(ours.named_parameters(), theirs.parameters(), strict=True):
@@ -237,12 +238,13 @@ def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dty
             their_part = their_state[index][key]
             torch.testing.assert_close(our[key], their_part, rtol=1e-5, atol=1e-6 * float(their_part.abs().max()))
     with torch.no_grad():
-        next(iter(native.copies())).add_(1.0)
-    assert native.copies() == {}
+        next(iter(native.copies)).add_(1.0)
+    assert not native.copies_are_true()
     optimizers[0].step()
-    assert native.copies() == {}
+    assert not native.copies_are_true()
     native.weights(0)
-    assert all(torch.equal(copy, weight.to(copy.dtype)) for weight, copy in native.copies().items())
+    assert native.copies_are_true()
+    assert all(torch.equal(copy, part.to(copy.dtype)) for part, copy in native.copies.items())
     with pytest.raises(ValueError, match="closure"):
         optimizers[0].step(lambda: 0.0)
     for optimizer, other in (optimizers, optimizers[::-1]):  # each goes on from the other's state

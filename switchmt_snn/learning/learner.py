@@ -39,7 +39,7 @@ def td_target(
     """
     action_B1 = q_choice_BA.argmax(dim=1, keepdim=True)
     value_B = q_next_BA.gather(1, action_B1).squeeze(1)
-    return rewards_B + discount * torch.where(terminated_B, torch.zeros_like(value_B), value_B)
+    return rewards_B + discount * value_B.masked_fill(terminated_B, 0.0)
 
 
 class Learner(Stateful):
@@ -54,7 +54,7 @@ class Learner(Stateful):
     """
 
     SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
-    DERIVED = ("config", "device", "_evaluate", "_group", "_invalid_KA", "_step")
+    DERIVED = ("config", "device", "_evaluate", "_group", "_invalid_KA", "_step", "_trained")
 
     def __init__(
         self,
@@ -79,6 +79,7 @@ class Learner(Stateful):
         self.device = device
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
+        self._trained = list(self.network.parameters())
         precision = torch.bfloat16 if config.precision == "bfloat16" else None
         self._group = group
         self._evaluate = make_evaluate(self.network, self.target, config.engine, precision, config.double_q, group)
@@ -137,18 +138,20 @@ class Learner(Stateful):
             target_B = td_target(rewards_B, batch.terminated_B, q_next_BA, q_choice_BA, config.discount)
         q_B = q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
         loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
-        self.network.zero_grad(set_to_none=True)
+        for parameter in self._trained:
+            parameter.grad = None
         loss.backward()
         if config.gradient_clip == "value":
-            torch.nn.utils.clip_grad_value_(self.network.parameters(), config.gradient_clip_at)
+            torch.nn.utils.clip_grad_value_(self._trained, config.gradient_clip_at)
         elif config.gradient_clip == "norm":
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip_at)
+            torch.nn.utils.clip_grad_norm_(self._trained, config.gradient_clip_at)
         self.optimizer.step()
-        means_2 = torch.stack([loss.detach(), q_B.detach().mean()])
-        if self._group is not None:
-            means_2 = self._group.sum(means_2) / self._group.size
-        self.loss_sum += means_2[0]
-        self.q_sum += means_2[1]
+        with torch.no_grad():
+            loss, q = loss.detach(), q_B.mean()
+            if self._group is not None:
+                loss, q = self._group.sum(torch.stack([loss, q])) / self._group.size
+            self.loss_sum += loss
+            self.q_sum += q
 
     def copy_target(self) -> None:
         """Q* <- Q, running statistics included."""

@@ -23,6 +23,8 @@ class _Tensor(ctypes.Structure):
         ("copy", ctypes.c_void_p),
         ("size", ctypes.c_long),
         ("low", ctypes.c_long),
+        ("channels", ctypes.c_long),
+        ("places", ctypes.c_long),
     )
 
 
@@ -36,6 +38,7 @@ class NativeAdam(torch.optim.Adam):
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float, eps: float, network: NativeNetwork) -> None:
         super().__init__(parameters, lr=lr, eps=eps, fused=True)
         self._network = network
+        self._tensors: ctypes.Array[_Tensor] | None = None
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a state of this class or of :class:`torch.optim.Adam`.
@@ -44,6 +47,7 @@ class NativeAdam(torch.optim.Adam):
             ValueError: its moments are not those of the parameters.
         """
         super().load_state_dict(state_dict)
+        self._tensors = None
         for parameter, state in self.state.items():
             for name in ("exp_avg", "exp_avg_sq"):
                 seen, expected = ((x.dtype, tuple(x.shape), x.stride()) for x in (state[name], parameter))
@@ -60,31 +64,42 @@ class NativeAdam(torch.optim.Adam):
         if closure is not None:
             raise ValueError("a closure, expected none: gradients are computed before a step")
         (group,) = self.param_groups
-        moved = [parameter for parameter in group["params"] if parameter.grad is not None]
-        copies, held = self._network.copies(), []  # held: what is pointed to must live until the call
-        tensors = (_Tensor * len(moved))()
-        for tensor, parameter in zip(tensors, moved, strict=True):
-            state, copy = self._state(parameter), copies.get(parameter)
-            gradient = _laid_out_like(parameter, parameter.grad)
-            held.append(gradient)
-            tensor.parameter, tensor.gradient = parameter.data_ptr(), gradient.data_ptr()
-            tensor.mean, tensor.square = state["exp_avg"].data_ptr(), state["exp_avg_sq"].data_ptr()
-            tensor.step, tensor.size = state["step"].data_ptr(), parameter.numel()
-            if copy is not None:
-                tensor.copy, tensor.low = copy.data_ptr(), copy.dtype == torch.bfloat16
+        were_true, held, moved = self._network.copies_are_true(), [], []  # held: what is pointed to must live
+        tensors = self._tensors = self._tensors or self._found(group["params"])
+        for tensor, parameter in zip(tensors, group["params"], strict=True):
+            tensor.gradient = None
+            if parameter.grad is not None:
+                gradient = _laid_out_like(parameter, parameter.grad)
+                tensor.gradient = gradient.data_ptr()
+                held.append(gradient)
+                moved.append(parameter)
         numbers = (group["lr"], *group["betas"], group["eps"])
-        library().snn_adam(ctypes.addressof(tensors), len(moved), *numbers, torch.get_num_threads())
+        library().snn_adam(ctypes.addressof(tensors), len(tensors), *numbers, torch.get_num_threads())
         torch.autograd.graph.increment_version(moved)
-        if copies:
-            self._network.copies_are_true()
+        if were_true:
+            self._network.note_true_copies()
 
-    def _state(self, parameter: Tensor) -> dict[str, Any]:
-        state: dict[str, Any] = self.state[parameter]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-            state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-        return state
+    # PyTorch would wrap it for hooks and profilers, which takes a hundredth of an update and is not used.
+    step.hooked = True  # type: ignore[attr-defined]
+
+    def _found(self, parameters: list[Tensor]) -> ctypes.Array[_Tensor]:
+        """Where parameters, their state and copies lie, which stay there."""
+        tensors = (_Tensor * len(parameters))()
+        for tensor, parameter in zip(tensors, parameters, strict=True):
+            state: dict[str, Any] = self.state[parameter]
+            if not state:
+                state["step"] = torch.zeros(())
+                state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+                state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+            tensor.parameter, tensor.size = parameter.data_ptr(), parameter.numel()
+            places = [state[name].data_ptr() for name in ("exp_avg", "exp_avg_sq", "step")]
+            tensor.mean, tensor.square, tensor.step = places
+            tensor.places = 1
+            if (copy := self._network.copies.get(parameter)) is not None:
+                tensor.copy, tensor.low = copy.data_ptr(), copy.dtype == torch.bfloat16
+                if copy.stride() != parameter.stride():  # images with channels innermost
+                    tensor.channels, tensor.places = parameter.shape[1], parameter[0, 0].numel()
+        return tensors
 
 
 def _laid_out_like(parameter: Tensor, gradient: Tensor) -> Tensor:

@@ -46,26 +46,35 @@ void make_currents(const float* a, const float* b, const float* mean, const floa
     }
 }
 
-// visit(t, membranes, which of them fired) for T steps of WIDTH channels of one row, or fewer.
-template <bool ZERO, class Y, class F>
-inline void integrate(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, long steps,
-                      long width, F visit) {
-    Lanes u = {}, fired = {}, gain = load(scale, width), offset = load(shift, width);
-    for (long t = 0; t < steps; t++) {
-        Lanes current = load(y + t * y_step, width) * gain + offset;
-        u = ZERO ? (u - u * fired) * n.beta + current : (u * n.beta + current) - fired * n.threshold;
-        Flags above = u > n.threshold;
-        fired = (Lanes)((Flags)same(1.0f) & above);
-        visit(t, u, fired, above);
-    }
+// visit(t, v, membranes, spikes, which of them fired) for T steps of V vectors of one row's channels; the last vector may
+// be shorter. More than one is worked on at once because a step waits for the one before it.
+template <bool ZERO, int V, class Y, class F>
+inline void integrate(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, long steps, long width,
+                      F visit) {
+    Lanes u[V] = {}, fired[V] = {}, gain[V], offset[V];
+    for (int v = 0; v < V; v++) gain[v] = load(scale + v * WIDTH, width), offset[v] = load(shift + v * WIDTH, width);
+    for (long t = 0; t < steps; t++)
+        for (int v = 0; v < V; v++) {
+            Lanes current = load(y + t * y_step + v * WIDTH, width) * gain[v] + offset[v];
+            u[v] = ZERO ? (u[v] - u[v] * fired[v]) * n.beta + current : (u[v] * n.beta + current) - fired[v] * n.threshold;
+            Flags above = u[v] > n.threshold;
+            fired[v] = (Lanes)((Flags)same(1.0f) & above);
+            visit(t, v, u[v], fired[v], above);
+        }
 }
 
-// run(first channel, number of them) over all channels; whole blocks have a constant width.
+template <int V>
+struct Vectors {
+    static constexpr int count = V;
+};
+
+// run(vectors, first channel, width of each) over all channels; whole vectors have a constant width.
 template <class F>
 inline void blocks(long channels, F run) {
     long c = 0;
-    for (; c + WIDTH <= channels; c += WIDTH) run(c, WIDTH);
-    if (c < channels) run(c, channels - c);
+    for (; c + 2 * WIDTH <= channels; c += 2 * WIDTH) run(Vectors<2>(), c, WIDTH);
+    for (; c + WIDTH <= channels; c += WIDTH) run(Vectors<1>(), c, WIDTH);
+    if (c < channels) run(Vectors<1>(), c, channels - c);
 }
 
 inline uint32_t bits_of(Flags above) {
@@ -79,74 +88,91 @@ inline uint32_t bits_of(Flags above) {
 }
 
 template <bool ZERO, class Y, class S>
-void fire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, S* spikes, long steps,
-          long rows, long channels, int threads) {
+void fire(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, S* spikes, long steps, long rows,
+          long channels, int threads) {
     long words = (channels + 31) / 32;
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (long r = 0; r < rows; r++)
-        blocks(channels, [&](long c, long width) {
+        blocks(channels, [=](auto vectors, long c, long width) {
+            constexpr int V = decltype(vectors)::count;
             long at = r * channels + c;
-            integrate<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width,
-                            [&](long t, Lanes, Lanes fired, Flags above) {
-                                if constexpr (std::is_same_v<S, uint32_t>) {  // lanes beyond the width are no channels
-                                    uint32_t bits = bits_of(above) & ((1u << width) - 1);
-                                    uint32_t* word = spikes + (t * rows + r) * words + c / 32;
-                                    *word = c % 32 ? *word | bits << WIDTH : bits;
-                                } else
-                                    store(spikes + t * rows * channels + at, fired, width);
-                            });
+            uint32_t bits[V];
+            integrate<ZERO, V>(n, y + at, y_step, scale + c, shift + c, steps, width,
+                               [&](long t, int v, Lanes, Lanes fired, Flags above) {
+                                   if constexpr (!std::is_same_v<S, uint32_t>)
+                                       return store(spikes + (t * rows * channels + at) + v * WIDTH, fired, width);
+                                   bits[v] = bits_of(above) & ((1u << width) - 1);  // lanes beyond it are no channels
+                                   if (v < V - 1) return;
+                                   uint32_t* word = (uint32_t*)spikes + (t * rows + r) * words + c / 32;
+                                   if (V == 2)
+                                       *word = bits[0] | bits[V - 1] << WIDTH;
+                                   else
+                                       *word = c % 32 ? *word | bits[0] << WIDTH : bits[0];
+                               });
         });
 }
 
 // Each neuron's mean spikes over the steps [R][C].
 template <bool ZERO, class Y>
-void fire_mean(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, float* mean, long steps,
+void fire_mean(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, float* mean, long steps,
                long rows, long channels, int threads) {
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (long r = 0; r < rows; r++)
-        blocks(channels, [&](long c, long width) {
+        blocks(channels, [=](auto vectors, long c, long width) {
+            constexpr int V = decltype(vectors)::count;
             long at = r * channels + c;
-            Lanes count = {};
-            integrate<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width,
-                            [&](long, Lanes, Lanes fired, Flags) { count += fired; });
-            store(mean + at, count / float(steps), width);
+            Lanes count[V] = {};
+            integrate<ZERO, V>(n, y + at, y_step, scale + c, shift + c, steps, width,
+                               [&](long, int v, Lanes, Lanes fired, Flags) { count[v] += fired; });
+            for (int v = 0; v < V; v++) store(mean + at + v * WIDTH, count[v] / float(steps), width);
         });
 }
 
 // The currents' gradient [T or 1][R][C], its sum [C] over steps and rows, and that of its product with y - center.
 template <bool ZERO, bool FAST_SIGMOID, class Y, class G>
-void unfire(const Neuron& n, const Y* y, long y_step, const float* scale, const float* shift, const float* center,
+void unfire(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, const float* center,
             const G* grad_spikes, long g_step, float* grad, double* sums, long steps, long rows, long channels,
             int threads) {
     std::vector<float> partial(PARTS * 2 * channels, 0.0f);
+    float* sums_of_parts = partial.data();
 #pragma omp parallel num_threads(threads)
     {
-        std::vector<Lanes> membranes(steps), spikes(steps);
+        std::vector<Lanes> scratch(steps * 4);  // of two vectors, membranes and spikes
+        Lanes* kept = scratch.data();
 #pragma omp for schedule(static)
         for (long part = 0; part < PARTS; part++)
             for (long r = rows * part / PARTS; r < rows * (part + 1) / PARTS; r++)
-                blocks(channels, [&](long c, long width) {
+                blocks(channels, [=](auto vectors, long c, long width) {
+                    constexpr int V = decltype(vectors)::count;
                     long at = r * channels + c;
-                    float *sum = &partial[part * 2 * channels + c], *sum_y = sum + channels;
-                    integrate<ZERO>(n, y + at, y_step, scale + c, shift + c, steps, width,
-                                    [&](long t, Lanes u, Lanes fired, Flags) { membranes[t] = u, spikes[t] = fired; });
-                    Lanes after = {}, total = {}, middle = load(center + c, width), product = load(sum_y, width);
-                    for (long t = steps - 1; t >= 0; t--) {
-                        Lanes kept = ZERO ? after - after * spikes[t] : after;
-                        Lanes slope = surrogate<FAST_SIGMOID>(n, membranes[t] - n.threshold);
-                        after = load(grad_spikes + t * g_step + at, width) * slope + kept * n.beta;
-                        total += after;
-                        if (y_step != 0) {
-                            store(grad + t * rows * channels + at, after, width);
-                            product += after * (load(y + t * y_step + at, width) - middle);
+                    integrate<ZERO, V>(n, y + at, y_step, scale + c, shift + c, steps, width,
+                                       [=](long t, int v, Lanes u, Lanes fired, Flags) {
+                                           kept[t * 2 * V + v] = u, kept[(t * 2 + 1) * V + v] = fired;
+                                       });
+                    float *sum = sums_of_parts + part * 2 * channels + c, *sum_y = sum + channels;
+                    Lanes after[V] = {}, total[V] = {}, middle[V], product[V];
+                    for (int v = 0; v < V; v++)
+                        middle[v] = load(center + c + v * WIDTH, width), product[v] = load(sum_y + v * WIDTH, width);
+                    for (long t = steps - 1; t >= 0; t--)
+                        for (int v = 0; v < V; v++) {
+                            Lanes before = ZERO ? after[v] - after[v] * kept[(t * 2 + 1) * V + v] : after[v];
+                            Lanes slope = surrogate<FAST_SIGMOID>(n, kept[t * 2 * V + v] - n.threshold);
+                            after[v] = load(grad_spikes + t * g_step + at + v * WIDTH, width) * slope + before * n.beta;
+                            total[v] += after[v];
+                            if (y_step != 0) {
+                                store(grad + t * rows * channels + at + v * WIDTH, after[v], width);
+                                product[v] += after[v] * (load(y + t * y_step + at + v * WIDTH, width) - middle[v]);
+                            }
                         }
+                    for (int v = 0; v < V; v++) {
+                        long here = v * WIDTH;
+                        if (y_step == 0) {
+                            store(grad + at + here, total[v], width);
+                            product[v] += total[v] * (load(y + at + here, width) - middle[v]);
+                        }
+                        store(sum + here, load(sum + here, width) + total[v], width);
+                        store(sum_y + here, product[v], width);
                     }
-                    if (y_step == 0) {
-                        store(grad + at, total, width);
-                        product += total * (load(y + at, width) - middle);
-                    }
-                    store(sum, load(sum, width) + total, width);
-                    store(sum_y, product, width);
                 });
     }
     for (long part = 0; part < PARTS; part++)
@@ -159,32 +185,55 @@ void combine(const float* grad, const Y* y, const float* scale, const float* cen
              const float* constant, Y* out, long rows, long channels, int threads) {
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (long r = 0; r < rows; r++)
-        for (long c = 0; c < channels; c++) {
-            long at = r * channels + c;
-            put(out + at, grad[at] * scale[c] + (number(y[at]) - center[c]) * slope[c] + constant[c]);
-        }
+        blocks(channels, [=](auto vectors, long c, long width) {
+            for (int v = 0; v < decltype(vectors)::count; v++, c += WIDTH) {
+                long at = r * channels + c;
+                Lanes moved = (load(y + at, width) - load(center + c, width)) * load(slope + c, width);
+                Lanes x = load(grad + at, width) * load(scale + c, width) + moved + load(constant + c, width);
+                store(out + at, x, width);
+            }
+        });
 }
 
+// Mean and biased variance [C], from those of parts (Chan et al., 1979).
 template <class Y>
 void moments(const Y* y, float* mean, float* variance, long rows, long channels, int threads) {
-    std::vector<float> partial(PARTS * channels);
-    for (bool squares : {false, true}) {
-        std::fill(partial.begin(), partial.end(), 0.0f);
+    std::vector<float> partial(PARTS * 3 * channels);  // means, and sums of differences to them and of their squares
+    float* of_parts = partial.data();
 #pragma omp parallel for schedule(static) num_threads(threads)
-        for (long part = 0; part < PARTS; part++) {
-            float* sum = &partial[part * channels];
-            for (long r = rows * part / PARTS; r < rows * (part + 1) / PARTS; r++)
-                for (long c = 0; c < channels; c++) {
-                    float x = number(y[r * channels + c]);
-                    sum[c] += squares ? (x - mean[c]) * (x - mean[c]) : x;
+    for (long part = 0; part < PARTS; part++)
+        blocks(channels, [=](auto vectors, long c, long width) {
+            constexpr int V = decltype(vectors)::count;
+            long first = rows * part / PARTS, end = rows * (part + 1) / PARTS;
+            Lanes middle[V] = {}, rest[V] = {}, squares[V] = {};
+            for (long r = first; r < end; r++)
+                for (int v = 0; v < V; v++) middle[v] += load(y + r * channels + c + v * WIDTH, width);
+            for (int v = 0; v < V; v++) middle[v] /= float(std::max(end - first, 1L));
+            for (long r = first; r < end; r++)
+                for (int v = 0; v < V; v++) {
+                    Lanes x = load(y + r * channels + c + v * WIDTH, width) - middle[v];
+                    rest[v] += x, squares[v] += x * x;
                 }
-        }
+            for (int v = 0; v < V; v++) {
+                float* to = of_parts + part * 3 * channels + c + v * WIDTH;
+                store(to, middle[v], width), store(to + channels, rest[v], width);
+                store(to + 2 * channels, squares[v], width);
+            }
+        });
+    std::vector<double> middle(channels, 0.0), squares(channels, 0.0);
+    double count = 0;  // of the parts so far
+    for (long part = 0; part < PARTS; part++) {
+        double here = double(rows * (part + 1) / PARTS - rows * part / PARTS), both = count + here;
+        if (here == 0) continue;
+        const float* of_part = of_parts + part * 3 * channels;
         for (long c = 0; c < channels; c++) {
-            double total = 0;
-            for (long part = 0; part < PARTS; part++) total += partial[part * channels + c];
-            (squares ? variance : mean)[c] = float(total / double(rows));
+            double rest = of_part[channels + c] / here, away = of_part[c] + rest - middle[c];
+            squares[c] += of_part[2 * channels + c] - rest * rest * here + away * away * (count * here / both);
+            middle[c] += away * (here / both);
         }
+        count = both;
     }
+    for (long c = 0; c < channels; c++) mean[c] = float(middle[c]), variance[c] = float(squares[c] / count);
 }
 
 template <class Y>
@@ -297,9 +346,16 @@ void snn_unfire(const Neuron* n, const void* y, int y_low, long y_step, const fl
     });
 }
 
-// Mean and biased variance of each channel.
-void snn_moments(const void* y, int y_low, float* mean, float* variance, long rows, long channels, int threads) {
+// Mean and biased variance of each channel; a running mean and unbiased variance, if there are any, move towards them.
+void snn_moments(const void* y, int y_low, float* mean, float* variance, float* running_mean, float* running_variance,
+                 float momentum, long rows, long channels, int threads) {
     with_type(y_low, [&](auto y_) { moments((const decltype(y_)*)y, mean, variance, rows, channels, threads); });
+    if (!running_mean) return;
+    float unbiased = float(double(rows) / double(rows - 1));
+    for (long c = 0; c < channels; c++) {
+        running_mean[c] += momentum * (mean[c] - running_mean[c]);
+        running_variance[c] += momentum * (variance[c] * unbiased - running_variance[c]);
+    }
 }
 
 // Images [B][C][P] of bytes, P places, times scale, to numbers [B][P][C].

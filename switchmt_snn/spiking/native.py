@@ -7,7 +7,8 @@ Shapes: S steps of the currents (T, or 1 that all steps share), T steps of the s
 from __future__ import annotations
 
 import ctypes
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterable
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,10 +23,6 @@ bit c % 32 of word c // 32; their mean over the steps ``[1, R, C]``, float32."""
 
 _SURROGATES = ("atan", "fast_sigmoid")
 """Those that ``native.cpp`` has."""
-
-
-_NOTHING = {dtype: torch.zeros((), dtype=dtype) for dtype in (torch.float32, torch.bfloat16)}
-"""Expanded to any shape, the way that gradients take where spikes are bits."""
 
 
 class _Neuron(ctypes.Structure):
@@ -54,15 +51,10 @@ def unsupported(config: NetworkConfig, spiking: bool) -> str | None:
 class Spikes(NamedTuple):
     """What a layer sends to the next one."""
 
-    numbers: Tensor
-    """``[T, ..., C]`` in memory. If there are bits, only the way that gradients take: it has no memory of its own."""
-    bits: Tensor | None = None
-    """int32 ``[T, ..., words]``: channel c is bit c % 32 of word c // 32."""
-
-    def with_rows(self, shape: tuple[int, ...]) -> Spikes:
-        """``[T, *shape, C]`` instead of ``[T, R, C]``."""
-        bits = None if self.bits is None else self.bits.unflatten(1, shape)
-        return Spikes(self.numbers.unflatten(1, shape), bits)
+    memory: Tensor
+    """Numbers ``[T, ..., C]``; or int32 words ``[T, ..., words]``, channel c being bit c % 32 of word c // 32."""
+    channels: int
+    is_bits: bool = False
 
 
 class Currents(NamedTuple):
@@ -74,16 +66,9 @@ class Currents(NamedTuple):
     variance_C: Tensor | None = None
     epsilon: float = 0.0
 
-    def places(self, channels: int) -> tuple[int | None, ...]:
-        """Where they lie.
-
-        Raises:
-            ValueError: something is not contiguous float32 for every channel.
-        """
-        for x in self[:4]:
-            if x is not None and (x.dtype != torch.float32 or x.shape != (channels,) or not x.is_contiguous()):
-                raise ValueError(f"{x.dtype} {tuple(x.shape)}, expected float32 for {channels} channels")
-        return tuple(None if x is None else x.data_ptr() for x in self[:4])
+    def places(self, channels: int) -> list[int | None]:
+        """Where they lie; see :func:`_places`."""
+        return _places(self[:4], channels)
 
 
 class Neurons:
@@ -102,44 +87,8 @@ class Neurons:
         self._neuron = _Neuron(beta, config.threshold, slope, config.reset == "zero", fast_sigmoid)
         self.timesteps = config.timesteps
 
-    def gated(self, y_SRC: Tensor, gain_C: Tensor | None, form: Form) -> Spikes:
-        """Spikes for currents ``y * gain`` (None: 1)."""
-        gain_C = torch.ones(y_SRC.shape[-1]) if gain_C is None else gain_C.contiguous()
-        return self._spikes(y_SRC, Currents(gain_C), form)
-
-    def normalized(
-        self,
-        y_SRC: Tensor,
-        weight_C: Tensor,
-        bias_C: Tensor,
-        moments: tuple[Tensor, Tensor],
-        epsilon: float,
-        of_batch: bool,
-        form: Form,
-    ) -> Spikes:
-        """Spikes for currents ``(y - mean) / sqrt(variance + epsilon) * weight + bias``.
-
-        ``of_batch``: the moments (mean and variance) are those of ``y``, and the gradient goes through them; else
-        there is no gradient.
-        """
-        currents = Currents(weight_C, bias_C, *moments, epsilon)
-        if of_batch:
-            return self._spikes(y_SRC, currents, form)
-        with torch.no_grad():
-            return self._spikes(y_SRC, currents, form)
-
-    def _spikes(self, y_SRC: Tensor, currents: Currents, form: Form) -> Spikes:
-        if torch.is_grad_enabled():
-            return Spikes(*_Spikes.apply(y_SRC, *currents[:2], self, currents, form))  # type: ignore[no-untyped-call]
-        return self._as_spikes(y_SRC, self.fire(y_SRC, currents, form)[0], form)
-
-    def _as_spikes(self, y_SRC: Tensor, spikes: Tensor, form: Form) -> Spikes:
-        if form != "bits":
-            return Spikes(spikes)
-        return Spikes(_NOTHING[y_SRC.dtype].expand(self.timesteps, *y_SRC.shape[1:]), spikes)
-
     def fire(self, y_SRC: Tensor, currents: Currents, form: Form) -> tuple[Tensor, Tensor]:
-        """Spikes without gradient; and the currents' scale, shift, mean and inverse deviation ``[4, C]``.
+        """Spikes; and the currents' scale, shift, mean and inverse deviation ``[4, C]``, which the gradient needs.
 
         Raises:
             ValueError: ``y`` is not contiguous float32 or bfloat16 of 1 or T steps; see :meth:`Currents.places`.
@@ -167,7 +116,10 @@ class Neurons:
         return spikes, currents_4C
 
     def unfire(self, y_SRC: Tensor, currents_4C: Tensor, grad_TRC: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients of ``y``, and ``[2, C]`` of gain (or weight) and bias."""
+        """Gradients of ``y``, and ``[2, C]`` of the currents' a and b, from those of the spikes.
+
+        Moments that the currents had are those of ``y``, and the gradient goes through them.
+        """
         steps, rows, channels = y_SRC.shape
         scratch_SRC, grad_y_SRC = torch.empty(steps, rows, channels), torch.empty_like(y_SRC)
         grad_2C = torch.empty(2, channels)
@@ -191,14 +143,22 @@ class Neurons:
         return grad_y_SRC, grad_2C
 
 
-def batch_moments(y_SRC: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and biased variance of every channel ``[C]`` over steps and rows."""
+def batch_moments(
+    y_SRC: Tensor, running: tuple[Tensor, Tensor] | None = None, momentum: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Mean and biased variance of every channel ``[C]`` over steps and rows.
+
+    A running mean and (unbiased) variance move towards them, as those of
+    :meth:`~switchmt_snn.spiking.normalization.TaskBatchNorm.move` do.
+
+    Raises:
+        ValueError: see :func:`_places`.
+    """
     y_SRC = y_SRC.contiguous()
     steps, rows, channels = y_SRC.shape
     mean_C, variance_C = torch.empty(channels), torch.empty(channels)
-    library().snn_moments(
-        *typed(y_SRC), mean_C.data_ptr(), variance_C.data_ptr(), steps * rows, channels, torch.get_num_threads()
-    )
+    places = _places((mean_C, variance_C, *(running or (None, None))), channels)
+    library().snn_moments(*typed(y_SRC), *places, momentum, steps * rows, channels, torch.get_num_threads())
     return mean_C, variance_C
 
 
@@ -213,31 +173,21 @@ def scaled_images(x_BCHW: Tensor, scale: float, dtype: torch.dtype) -> Tensor:
     return out_BHWC.permute(0, 3, 1, 2)
 
 
-class _Spikes(torch.autograd.Function):
-    """The gradient's way through currents and neurons; a and b are gain or weight, and bias."""
+def _places(numbers_C: Iterable[Tensor | None], channels: int) -> list[int | None]:
+    """Where numbers of channels lie.
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        y_SRC: Tensor,
-        _: Tensor,
-        b_C: Tensor | None,
-        neurons: Neurons,
-        currents: Currents,
-        form: Form,
-    ) -> tuple[Tensor, Tensor | None]:
-        spikes, currents_4C = neurons.fire(y_SRC, currents, form)
-        ctx.save_for_backward(y_SRC, currents_4C)
-        ctx.neurons, ctx.has_bias, ctx.is_mean = neurons, b_C is not None, form == "mean"
-        return neurons._as_spikes(y_SRC, spikes, form)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        steps, grad_TRC = ctx.neurons.timesteps, gradients[0]
-        if ctx.is_mean:
-            grad_TRC = (grad_TRC / steps).expand(steps, -1, -1)
-        grad_y_SRC, (grad_a_C, grad_b_C) = ctx.neurons.unfire(*ctx.saved_tensors, grad_TRC)
-        return grad_y_SRC, grad_a_C, grad_b_C if ctx.has_bias else None, None, None, None
+    Raises:
+        ValueError: something is not contiguous float32 for every channel.
+    """
+    places: list[int | None] = []
+    for x in numbers_C:
+        if x is None:
+            places.append(None)
+            continue
+        if x.dtype != torch.float32 or x.shape != (channels,) or not x.is_contiguous():
+            raise ValueError(f"{x.dtype} {tuple(x.shape)}, expected float32 for {channels} channels")
+        places.append(x.data_ptr())
+    return places
 
 
 def _step(y_SRC: Tensor) -> int:

@@ -15,7 +15,8 @@ struct Tensor {
     const float* gradient;
     float* step;  // number of them
     void* copy;   // or none
-    long size, low;  // numbers; whether the copy is bfloat16
+    long size, low;         // numbers; whether the copy is bfloat16
+    long channels, places;  // numbers [...][channels][places] have the copy [...][places][channels]
 };
 
 inline Lanes root(Lanes x) {
@@ -38,13 +39,20 @@ void move(const Tensor& t, Copy* copy, long first, long end, double rate, double
         store(t.mean + i, mean, width);
         store(t.square + i, square, width);
         store(t.parameter + i, parameter, width);
-        if (copy) store(copy + i, parameter, width);
+        if (!copy) continue;
+        if (t.places == 1)
+            store(copy + i, parameter, width);
+        else
+            for (long j = i; j < i + width; j++) {
+                long place = j % t.places, channel = j / t.places % t.channels;
+                put(copy + (j - channel * t.places - place) + place * t.channels + channel, parameter[j - i]);
+            }
     }
 }
 
 }  // namespace
 
-// One step for `count` tensors.
+// One step for those of `count` tensors that have a gradient.
 extern "C" void snn_adam(const Tensor* tensors, long count, double rate, double beta1, double beta2, double epsilon,
                          int threads) {
     constexpr long PART = 1 << 14;
@@ -53,6 +61,7 @@ extern "C" void snn_adam(const Tensor* tensors, long count, double rate, double 
     };
     std::vector<Part> parts;
     for (long n = 0; n < count; n++) {
+        if (!tensors[n].gradient) continue;
         *tensors[n].step += 1.0f;
         for (long first = 0; first < tensors[n].size; first += PART) parts.push_back({n, first});
     }

@@ -7,6 +7,8 @@ Shapes: I images, H, W places, C channels in, O channels out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -52,7 +54,7 @@ def convolution_weight_gradient(x_ICHW: Tensor, grad_y: Tensor, weight: Tensor, 
     return grad_OkkC.permute(0, 3, 1, 2), grad_O
 
 
-def convolution_input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: tuple[int, int]) -> Tensor:
+def convolution_input_gradient(grad_y: Tensor, weight: Tensor, stride: int, sides: Sequence[int]) -> Tensor:
     """``[I, C, *sides]`` from that of the products ``[I, O, h, w]``."""
     out_channels, channels, kernel, _ = weight.shape
     unseen, taps = [(side - kernel) % stride for side in sides], kernel // stride

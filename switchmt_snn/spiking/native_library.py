@@ -22,7 +22,7 @@ from torch import Tensor
 _HEADER = Path(__file__).with_name("native_numbers.h")
 _SOURCES = tuple(
     Path(__file__).with_name(name)
-    for name in ("native.cpp", "native_products.cpp", "native_bfloat16.cpp", "native_adam.cpp")
+    for name in ("native.cpp", "native_streams.cpp", "native_products.cpp", "native_bfloat16.cpp", "native_adam.cpp")
 )
 # No contraction of a*b+c into one rounding: spikes shall be those of PyTorch's operations.
 _FLAGS = (
@@ -41,8 +41,13 @@ _ARGUMENTS = {
     "snn_fire_bits": "ppilppppfppllli",
     "snn_fire_mean": "ppilppppfppllli",
     "snn_unfire": "ppilppilpppllli",
-    "snn_moments": "pipplli",
+    "snn_moments": "pippppflli",
     "snn_images": "pfpillli",
+    "snn_gains": "pllllipl",
+    "snn_gains_gradient": "pllllippl",
+    "snn_heads": "plppll",
+    "snn_read_out": "ppppllli",
+    "snn_heads_gradient": "plpppfpllli",
     "snn_adam": "plddddi",
 }
 """Pointers, ints, longs, floats and doubles that the functions take."""

@@ -1,32 +1,34 @@
 """A network's decision through the native neuron layers: the same function as :meth:`QNetwork.decide`.
 
 Synaptic products are :mod:`switchmt_snn.spiking.native_products`', neurons :mod:`switchmt_snn.spiking.native`'s, and
-channels lie innermost.
+channels lie innermost. From the encoded inputs to the heads' outputs, autograd sees one operation: between some fifty
+calls into C++, what PyTorch's and Python's caches have lost is what takes time.
 
-Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons.
+Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons
+of all streams, A actions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, cast
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
-from switchmt_snn.spiking.native import Form, Neurons, Spikes, batch_moments, scaled_images
-from switchmt_snn.spiking.native_products import Synapses, connected, convolved, spikes_as_bits
+from switchmt_snn.spiking.native import Currents, Form, Neurons, Spikes, batch_moments, scaled_images
+from switchmt_snn.spiking.native_products import Gradients, Synapses, connected, convolved, spikes_as_bits
+from switchmt_snn.spiking.native_streams import Gains, Heads
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
-_STREAMS = "streams"
-"""All streams have the same inputs, so their synapses are one layer."""
+WayBack = Callable[[Tensor], list[Tensor]]
+"""From the gradient of the heads' outputs to those of :attr:`NativeNetwork._differentiated`."""
 
 
 class Weights(NamedTuple):
-    """A network as one task sees it, until its parameters change: the copies of weights are then written anew."""
+    """What a task changes, until the network's parameters change."""
 
-    synapses: dict[str, Synapses]
-    """By layer name."""
+    task: int
     gain_N: Tensor
     """Of the dendrites of all streams, one after the other."""
     context: Context
@@ -38,6 +40,9 @@ class NativeNetwork:
     With ``torch.bfloat16``, weights, synaptic products and the gradients of products and inputs are rounded to it, as
     under autocast; biases and the gradients of weights are not, except in PyTorch's products. All else is float32.
     Everything is on the CPU. A change of parameters through ``.data`` is not seen.
+
+    Attributes:
+        copies: what products read instead of parameters, by parameter; images have channels innermost.
     """
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
@@ -45,21 +50,25 @@ class NativeNetwork:
         self._network = network
         self._parameters = list(network.parameters())
         self._dtype = torch.float32 if precision is None else precision
-        self._form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
-        self._neurons = Neurons(network.config)
-        layers = {name: [layer] for name, layer in network.trunk.items()} | {_STREAMS: [*network.streams.values()]}
-        self._layers = {name: _modules(owners) for name, owners in layers.items()}
-        self._matrices: dict[str, Tensor] = {}
-        self._copies: dict[Tensor, Tensor] = {}
-        for name, modules in self._layers.items():
-            if all(isinstance(module, nn.Linear) for module in modules):
-                weights = [module.weight for module in modules]
-                sizes = [len(weight) for weight in weights]
-                self._matrices[name] = torch.empty(sum(sizes), weights[0].shape[1], dtype=self._dtype)
-                self._copies |= dict(zip(weights, self._matrices[name].split(sizes), strict=True))
+        form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
+        neurons = self._neurons = Neurons(network.config)
+        self._is_mean = network.config.readout == "mean"
+        self._last_form: Form = "mean" if self._is_mean else "floats"
+        self._trunk = {
+            name: _Layer(cast(TrunkLayer, layer), self._dtype, neurons, form) for name, layer in network.trunk.items()
+        }
+        streams = [cast(Stream, stream) for stream in network.streams.values()]
+        self._streams = Synapses([stream.synapses for stream in streams], self._dtype)
+        self._gains = Gains(streams)
+        self._synapses = [*(layer.synapses for layer in self._trunk.values()), self._streams]
+        self._heads = Heads(network)
+        of_trunk = [part for layer in self._trunk.values() for part in layer.parameters]
+        of_streams = (*self._streams.parameters, *self._gains.parameters, *self._heads.parameters)
+        self._differentiated = (*of_trunk, *of_streams)
+        self.copies = {part: copy for synapses in self._synapses for part, copy in synapses.copies.items()}
         self._copied_version = self._version = -1
-        self._synapses: dict[str, Synapses] = {}
         self._by_task: dict[int, Weights] = {}
+        self._contexts: dict[int, Context] = {}
 
     def inputs(self, observation: Tensor, generator: torch.Generator) -> Tensor:
         """Encoded inputs ``[S, B, H, W, C]`` or ``[S, B, C]`` in the products' dtype for raw observations."""
@@ -70,103 +79,132 @@ class NativeNetwork:
         x = network.encode(observation, generator).to(self._dtype)
         return x.movedim(2, -1).contiguous()
 
-    def copies(self) -> dict[Tensor, Tensor]:
-        """The copies of weights that products read, by parameter; none if they are not those of the parameters as they
-        are now. Who changes parameters may change all their copies as well, and say so (:meth:`copies_are_true`); else
-        :meth:`weights` makes them anew."""
-        return self._copies if self._version_now() == self._copied_version else {}
+    def copies_are_true(self) -> bool:
+        """Whether all :attr:`copies` are those of the parameters as they are now."""
+        return self._version_now() == self._copied_version
 
-    def copies_are_true(self) -> None:
-        """All copies are those of the parameters as they are now."""
+    def note_true_copies(self) -> None:
+        """Who changed parameters has changed their copies as well; else :meth:`weights` makes them anew."""
         self._copied_version = self._version_now()
 
     def _version_now(self) -> int:
         return sum(parameter._version for parameter in self._parameters)
 
     def weights(self, task: int) -> Weights:
-        """For a task, as they are now; those of a network without gradients are kept until they change."""
+        """For a task, as they are now; kept until they change."""
         version = self._version_now()
-        if version != self._version or any(parameter.requires_grad for parameter in self._parameters):
-            self._synapses = self._read_synapses(version)
-            self._version, self._by_task = version, {}
+        if version != self._version:
+            if version != self._copied_version:
+                for synapses in self._synapses:
+                    synapses.read()
+            self._heads.read()
+            self._copied_version = self._version = version
+            self._by_task = {}
         if task not in self._by_task:
-            context = self._network.context(task)
-            gains = [_gains(cast(Stream, stream), context[name]) for name, stream in self._network.streams.items()]
-            self._by_task[task] = Weights(self._synapses, torch.cat(gains), context)
+            if task not in self._contexts:
+                self._contexts[task] = self._network.context(task)  # views, which see changes
+            self._by_task[task] = Weights(task, self._gains.of_task(task), self._contexts[task])
         return self._by_task[task]
-
-    def _read_synapses(self, version: int) -> dict[str, Synapses]:
-        if version != self._copied_version:
-            with torch.no_grad():
-                for parameter, copy in self._copies.items():
-                    copy.copy_(parameter)
-            self._copied_version = version
-        synapses = {}
-        for name, modules in self._layers.items():
-            if name in self._matrices:
-                synapses[name] = Synapses.of_linear(cast(list[nn.Linear], modules), self._matrices[name])
-            else:
-                synapses[name] = Synapses.of_convolution(cast(nn.Conv2d, modules[0]), self._dtype)
-        return synapses
 
     def decide(self, x: Tensor, weights: Weights, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
         """Q-values ``[B, A]`` of :meth:`inputs`, normalised as ``training`` says; and after them those of other inputs,
-        normalised by the running statistics and without gradient."""
-        with torch.no_grad():  # first: training moves the running statistics
-            others = [self._features(other, weights, training=False) for other in beside]
-        y_TBN, *others_TBN = connected(self._features(x, weights, training), weights.synapses[_STREAMS], others)
-        q_BA = self._read_out(y_TBN, weights)
-        with torch.no_grad():
-            return [q_BA, *(self._read_out(other_TBN, weights) for other_TBN in others_TBN)]
+        normalised by the running statistics. Only the first ones of training have a gradient."""
+        if training and torch.is_grad_enabled():
+            outputs = _Decision.apply(self, x, weights, beside, *self._differentiated)  # type: ignore[no-untyped-call]
+        else:
+            with torch.no_grad():
+                outputs, _ = self._outputs(x, weights, training, beside)
+        if self._is_mean:
+            return list(outputs)
+        return [self._network.highest(self._network.integrate(output_TBA)) for output_TBA in outputs]
 
-    def _features(self, x: Tensor, weights: Weights, training: bool) -> Spikes:
-        """What the trunk sends to the streams."""
-        spikes, (synapses, _, context) = Spikes(x), weights
-        for name, layer in self._network.trunk.items():
-            spikes = self._trunk_layer(cast(TrunkLayer, layer), spikes, context[name], synapses[name], training)
+    def _outputs(
+        self, x: Tensor, weights: Weights, training: bool, beside: Sequence[Tensor]
+    ) -> tuple[list[Tensor], WayBack]:
+        """What the heads send on, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``; and the first one's way back."""
+        layers: list[Gradients] = []
+        others = [self._features(other, weights, training=False) for other in beside]  # first: training moves averages
+        ys, of_streams = connected([self._features(x, weights, training, layers), *others], self._streams)
+        currents, form = Currents(weights.gain_N), self._last_form
+        fired = [self._neurons.fire(y_TBN, currents, form) for y_TBN in ys]
+        outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
+
+        def way_back(grad: Tensor) -> list[Tensor]:
+            spikes_SBN, currents_4N = fired[0]
+            steps, grad_SBA = self._neurons.timesteps, grad.contiguous().view(outputs[0].shape)
+            scale = 1.0 / steps if self._is_mean else 1.0
+            grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBA, scale)
+            grad_y, (grad_gain_N, _) = self._neurons.unfire(ys[0], currents_4N, grad_SBN.expand(steps, -1, -1))
+            of_gains = self._gains.gradients(weights.task, grad_gain_N)
+            grad_x, of_synapses = of_streams(grad_y, bool(layers))
+            parts = [*of_synapses, *of_gains, *of_heads]
+            while layers:  # what a layer kept is let go
+                grad_x, of_layer = layers.pop()(cast(Tensor, grad_x), bool(layers))
+                parts = [*of_layer, *parts]
+            return parts
+
+        return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], way_back
+
+    def _features(self, x: Tensor, weights: Weights, training: bool, layers: list[Gradients] | None = None) -> Spikes:
+        """What the trunk sends to the streams; each layer's gradients are appended to ``layers``."""
+        spikes = Spikes(x, x.shape[-1])
+        for name, layer in self._trunk.items():
+            spikes, gradients = layer.fire(spikes, weights.context[name], training)
+            if layers is not None:
+                layers.append(gradients)
         return spikes
 
-    def _read_out(self, y_TBN: Tensor, weights: Weights) -> Tensor:
-        """Q-values of the streams' synaptic products, which lie one after the other."""
-        network, over_time = self._network, self._network.config.readout == "mean"
-        spikes_TBN = self._neurons.gated(y_TBN, weights.gain_N, "mean" if over_time else "floats").numbers
-        sizes, outputs = [bias.shape[0] for bias in weights.synapses[_STREAMS].parameters[1::2]], {}
-        for (name, layer), part_TBN in zip(network.streams.items(), spikes_TBN.split(sizes, dim=-1), strict=True):
-            stream = cast(Stream, layer)
-            outputs[name] = stream.head(part_TBN[0]) if over_time else network.read_out(stream, part_TBN)
-        return network.combine(outputs)
 
-    def _trunk_layer(
-        self, layer: TrunkLayer, x: Spikes, context: tuple[Tensor, ...], synapses: Synapses, training: bool
-    ) -> Spikes:
-        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``, as the next layer reads them."""
-        if layer.normalization is None:
-            (y_SBN,) = connected(x, synapses)
-            return self._neurons.gated(y_SBN, None, self._form)
-        y = convolved(x, synapses)
-        y_SRC = y.flatten(1, -2)
-        normalization, (mean_C, var_C) = layer.normalization, context
-        if training:
-            mean_C, var_C = batch_moments(y_SRC.detach())
-            normalization.move(context, mean_C, var_C, y_SRC.shape[0] * y_SRC.shape[1])
-        spikes = self._neurons.normalized(
-            y_SRC,
-            normalization.weight,
-            normalization.bias,
-            (mean_C, var_C),
-            normalization.epsilon,
-            of_batch=training,
-            form=self._form,
-        )
-        return spikes.with_rows(y.shape[1:-1])
+class _Layer:
+    """A layer of the trunk: products, normalisation if it has one, neurons."""
+
+    def __init__(self, layer: TrunkLayer, dtype: torch.dtype, neurons: Neurons, form: Form) -> None:
+        module = layer.synapses[-1] if isinstance(layer.synapses, nn.Sequential) else layer.synapses
+        self.synapses = Synapses([cast(nn.Linear | nn.Conv2d, module)], dtype)
+        self._normalization, self._neurons, self._form = layer.normalization, neurons, form
+        self.parameters = self.synapses.parameters
+        if self._normalization is None:
+            self._currents = Currents(torch.ones(len(self.synapses.bias)))
+        else:
+            affine = self._normalization.weight, self._normalization.bias
+            self.parameters += affine
+            weight_C, bias_C = (part.detach() for part in affine)
+            self._currents = Currents(weight_C, bias_C, epsilon=self._normalization.epsilon)
+
+    def fire(self, x: Spikes, context: tuple[Tensor, ...], training: bool) -> tuple[Spikes, Gradients]:
+        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and from their gradient to those of ``x`` and the parameters."""
+        neurons, normalization, currents = self._neurons, self._normalization, self._currents
+        if normalization is None:
+            (y,), of_products = connected([x], self.synapses)
+            y_SRC = y
+        else:
+            y, of_products = convolved(x, self.synapses)
+            y_SRC, (mean_C, var_C) = y.flatten(1, -2), context
+            if training:
+                mean_C, var_C = batch_moments(y_SRC, (mean_C, var_C), normalization.momentum)
+            currents = currents._replace(mean_C=mean_C, variance_C=var_C)
+        memory, currents_4C = neurons.fire(y_SRC, currents, self._form)
+
+        def gradients(grad: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
+            grad_TRC = grad.view(neurons.timesteps, *y_SRC.shape[1:])
+            grad_y, grad_2C = neurons.unfire(y_SRC, currents_4C, grad_TRC)
+            grad_x, parts = of_products(grad_y, of_inputs)
+            return grad_x, parts if normalization is None else [*parts, *grad_2C]
+
+        shape = (neurons.timesteps, *y.shape[1:-1], memory.shape[-1])
+        return Spikes(memory.view(shape), y.shape[-1], self._form == "bits"), gradients
 
 
-def _gains(stream: Stream, context: tuple[Tensor, ...]) -> Tensor:
-    size = stream.synapses.out_features
-    return torch.ones(size) if stream.dendrites is None else stream.dendrites.gains(*context).expand(size)
+class _Decision(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, network: NativeNetwork, x: Tensor, weights: Weights, beside: Sequence[Tensor], *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        outputs, ctx.way_back = network._outputs(x, weights, True, beside)
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(*outputs[1:])
+        return tuple(outputs)
 
-
-def _modules(owners: list[nn.Module]) -> list[nn.Linear | nn.Conv2d]:
-    """The modules that have the synapses."""
-    synapses = (cast(TrunkLayer | Stream, owner).synapses for owner in owners)
-    return [cast(nn.Linear | nn.Conv2d, part[-1] if isinstance(part, nn.Sequential) else part) for part in synapses]
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, None, None, *ctx.way_back(gradients[0])

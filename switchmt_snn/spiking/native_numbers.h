@@ -5,6 +5,10 @@
 #include <cstdint>
 #include <cstring>
 
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
+
 struct BFloat16 {
     uint16_t bits;
 };
@@ -33,6 +37,23 @@ typedef int32_t Flags __attribute__((vector_size(4 * WIDTH)));  // all bits of a
 typedef uint32_t Words __attribute__((vector_size(4 * WIDTH)));
 typedef uint16_t Halves __attribute__((vector_size(2 * WIDTH)));
 
+// Lengthened and shortened in one instruction; compilers take four for __builtin_convertvector.
+inline Words widen(Halves x) {
+#ifdef __AVX512F__
+    return (Words)_mm512_cvtepu16_epi32((__m256i)x);
+#else
+    return __builtin_convertvector(x, Words);
+#endif
+}
+
+inline Halves narrow(Words x) {
+#ifdef __AVX512F__
+    return (Halves)_mm512_cvtepi32_epi16((__m512i)x);
+#else
+    return __builtin_convertvector(x, Halves);
+#endif
+}
+
 inline Lanes same(float x) { return Lanes{} + x; }
 
 // Of fewer than WIDTH numbers, the other lanes are 0 when they are read, and not written.
@@ -51,7 +72,7 @@ inline Lanes load(const BFloat16* place, long width) {
         std::memcpy(&x, place, sizeof x);
     else
         std::memcpy(&x, place, width * sizeof *place);
-    return (Lanes)(__builtin_convertvector(x, Words) << 16);
+    return (Lanes)(widen(x) << 16);
 }
 
 inline void store(float* place, Lanes x, long width) {
@@ -63,7 +84,7 @@ inline void store(float* place, Lanes x, long width) {
 
 inline void store(BFloat16* place, Lanes x, long width) {  // as put()
     Words bits = (Words)x, rounded = (bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16;
-    Halves halves = __builtin_convertvector(x != x ? Words{} + 0x7fc0u : rounded, Halves);
+    Halves halves = narrow(x != x ? Words{} + 0x7fc0u : rounded);
     if (width == WIDTH)
         std::memcpy(place, &halves, sizeof halves);
     else

@@ -189,17 +189,36 @@ void snn_windows(const uint32_t* spikes, uint32_t* panels, long images, long hei
 
 // Panels of whole images, one per lane: bit c * places + p. spikes [images][places][words of channels].
 void snn_flat(const uint32_t* spikes, uint32_t* panels, long images, long places, long channels, int threads) {
-    long from_words = (channels + 31) / 32, words = (channels * places + 31) / 32;
-#pragma omp parallel for schedule(static) num_threads(threads)
-    for (long p = 0; p < (images + LANES - 1) / LANES; p++) {
-        uint32_t* to = panels + p * words * LANES;
-        std::fill(to, to + words * LANES, 0u);
-        for (long l = 0; l < std::min(LANES, images - p * LANES); l++)
-            for (long i = 0; i < places * from_words; i++)
-                for (uint32_t word = spikes[(p * LANES + l) * places * from_words + i]; word; word &= word - 1) {
-                    long k = (i % from_words * 32 + __builtin_ctz(word)) * places + i / from_words;
-                    to[k / 32 * LANES + l] |= 1u << (k % 32);
+    long from_words = (channels + 31) / 32, words = (channels * places + 31) / 32, room = (places + 15) / 16 * 16;
+#pragma omp parallel num_threads(threads)
+    {
+        std::vector<uint32_t> column(room);  // one word of every place
+#pragma omp for schedule(static)
+        for (long lane = 0; lane < (images + LANES - 1) / LANES * LANES; lane++) {
+            uint32_t* to = panels + lane / LANES * words * LANES + lane % LANES;
+            if (lane >= images) {
+                for (long w = 0; w < words; w++) to[w * LANES] = 0;
+                continue;
+            }
+            uint64_t waiting = 0;
+            long count = 0;  // bits that wait
+            for (long c = 0; c < channels; c++) {
+                if (c % 32 == 0)
+                    for (long p = 0; p < places; p++)
+                        column[p] = spikes[(lane * places + p) * from_words + c / 32];
+                __m512i bit = _mm512_set1_epi32(1u << (c % 32));
+                for (long p = 0; p < places; p += 16) {
+                    __m512i some = _mm512_loadu_si512(column.data() + p);
+                    waiting |= uint64_t(_mm512_test_epi32_mask(some, bit)) << count;
+                    count += std::min(16L, places - p);
+                    if (count >= 32) {
+                        *to = uint32_t(waiting);
+                        to += LANES, waiting >>= 32, count -= 32;
+                    }
                 }
+            }
+            if (count > 0) *to = uint32_t(waiting);
+        }
     }
 }
 

@@ -8,8 +8,8 @@ Shapes: T steps, B batch, I = T * B images, H, W places, C channels in, O channe
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from switchmt_snn.spiking.native import Spikes
 from switchmt_snn.spiking.native_dense import (
+    channels_last,
     convolution,
     convolution_input_gradient,
     convolution_weight_gradient,
@@ -28,6 +29,10 @@ from switchmt_snn.spiking.native_library import library, typed
 
 _LANES = 64
 
+Gradients = Callable[[Tensor, bool], tuple[Tensor | None, list[Tensor]]]
+"""From the gradient of the products (``[I, ..., O]``, contiguous, in their dtype): that of the inputs, if asked for, as
+numbers ``[I, ..., C]`` that lie in memory as the inputs do; and those of :attr:`Synapses.parameters`, float32."""
+
 
 def spikes_as_bits(dtype: torch.dtype) -> bool:
     """Whether products of spikes in a dtype are those of bits here: the processor needs AVX-512, and for bfloat16 no
@@ -35,36 +40,45 @@ def spikes_as_bits(dtype: torch.dtype) -> bool:
     return bool(library().snn_has_products()) and not (dtype == torch.bfloat16 and has_amx())
 
 
-class Synapses(NamedTuple):
-    """Synapses of a layer, or of several fully connected layers with the same inputs, one after the other."""
+class Synapses:
+    """Synapses of a convolution, or of fully connected layers with the same inputs, one after the other.
 
-    parameters: tuple[Tensor, ...]
-    """Weight and bias of each layer, which get the gradients."""
-    weight: Tensor
-    """In the products' dtype, channels innermost."""
-    bias: Tensor
-    stride: int
+    Attributes:
+        parameters: weight and bias of each layer.
+        weight: copies of all weights in the products' dtype, a convolution's with channels innermost.
+        bias: all biases.
+        stride: a convolution's.
+        copies: what was made of parameters by copying, by parameter.
+    """
 
-    @classmethod
-    def of_convolution(cls, layer: nn.Conv2d, dtype: torch.dtype) -> Synapses:
-        """As the parameters are now."""
-        weight, bias = layer.weight, cast(Tensor, layer.bias)
-        rounded = weight.detach().to(dtype, memory_format=torch.channels_last)
-        return cls((weight, bias), rounded, bias.detach(), layer.stride[0])
+    def __init__(self, layers: Sequence[nn.Linear | nn.Conv2d], dtype: torch.dtype) -> None:
+        """Nothing is read yet; see :meth:`read`."""
+        weights, biases = [layer.weight for layer in layers], [cast(Tensor, layer.bias) for layer in layers]
+        self.parameters = tuple(part for layer in zip(weights, biases, strict=True) for part in layer)
+        sizes = [len(weight) for weight in weights]
+        outputs, (channels, *kernel) = sum(sizes), weights[0].shape[1:]
+        self._memory = torch.empty(outputs, *kernel, channels, dtype=dtype)
+        self._missing = -channels % 32 if kernel else 0
+        self._flat = self._memory.flatten(1)
+        self.weight = self._memory.movedim(-1, 1)
+        self.stride = layers[0].stride[0] if isinstance(layers[0], nn.Conv2d) else 0
+        self.copies = dict(zip(weights, self.weight.split(sizes), strict=True))
+        self.bias = biases[0].detach()
+        if len(layers) > 1:
+            self.bias = torch.empty(outputs)
+            self.copies |= dict(zip(biases, self.bias.split(sizes), strict=True))
 
-    @classmethod
-    def of_linear(cls, layers: Sequence[nn.Linear], weight: Tensor) -> Synapses:
-        """As the biases are now; ``weight`` holds the copies of all weights."""
-        parameters = tuple(part for layer in layers for part in (layer.weight, layer.bias))
-        return cls(parameters, weight, torch.cat(parameters[1::2]).detach(), 0)
+    def read(self) -> Synapses:
+        """Make the copies those of the parameters as they are now."""
+        with torch.no_grad():
+            for part, copy in self.copies.items():
+                copy.copy_(part)
+        return self
 
     @property
     def matrix(self) -> Tensor:
         """The weights ``[O, bits]`` for products of bits, a convolution's filled up to whole words of channels."""
-        if self.weight.dim() == 2:
-            return self.weight
-        matrix, missing = self.weight.permute(0, 2, 3, 1), -self.weight.shape[1] % 32
-        return (F.pad(matrix, (0, missing)) if missing else matrix).flatten(1)
+        return F.pad(self._memory, (0, self._missing)).flatten(1) if self._missing else self._flat
 
 
 class Panels(NamedTuple):
@@ -94,17 +108,21 @@ class Panels(NamedTuple):
         return panels
 
     @classmethod
-    def of_images(cls, bits_Iw: Tensor, channels: int) -> Panels:
-        """A lane for every image ``[I, ..., words]``; its bits are in the order ``[C, places]``.
+    def of_images(cls, bits_Iw: Tensor, channels: int, words: Tensor | None = None) -> Panels:
+        """A lane for every image ``[I, ..., words]``; its bits are in the order ``[C, places]``. They are written to
+        ``words``, if given, such as a part of :meth:`empty`'s.
 
         Raises:
-            ValueError: the words are not contiguous int32.
+            ValueError: words are not contiguous int32, or not as many as needed.
         """
         images, *sides, _ = bits_Iw.shape
-        panels = cls.empty(images, channels * math.prod(sides))
-        sizes = (images, math.prod(sides), channels, torch.get_num_threads())
-        library().snn_flat(_words(bits_Iw), panels.words.data_ptr(), *sizes)
-        return panels
+        places = math.prod(sides)
+        shape = (-(-images // _LANES), -(-channels * places // 32), _LANES)
+        words = torch.empty(shape, dtype=torch.int32) if words is None else words
+        if words.shape != shape:
+            raise ValueError(f"words {tuple(words.shape)}, expected {shape}")
+        library().snn_flat(_words(bits_Iw), _words(words), images, places, channels, torch.get_num_threads())
+        return cls(words, images, channels * places)
 
     def transposed(self) -> Panels:
         """``[bits, lanes]``."""
@@ -151,88 +169,77 @@ class Panels(NamedTuple):
         return grad_weight, grad_bias
 
 
-def convolved(x: Spikes, synapses: Synapses) -> Tensor:
+def convolved(x: Spikes, synapses: Synapses) -> tuple[Tensor, Gradients]:
     """A convolution's products ``[T, B, h, w, O]``, contiguous, for ``[T, B, H, W, C]``."""
-    steps, sides = x.numbers.shape[:2], x.numbers.shape[2:4]
-    kernel, stride = synapses.weight.shape[-1], synapses.stride
-    numbers_ICHW = x.numbers.flatten(0, 1).permute(0, 3, 1, 2)
-    if x.bits is None:
-        y = _Convolution.apply(numbers_ICHW, synapses, *synapses.parameters)  # type: ignore[no-untyped-call]
-        return y.permute(0, 2, 3, 1).unflatten(0, steps)  # type: ignore[no-any-return]
-    panels = Panels.of_windows(x.bits.flatten(0, 1), kernel, stride)
-    y = _SpikeConvolution.apply(numbers_ICHW, synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
-    return y.view(*steps, *(out_side(side, kernel, stride) for side in sides), -1)  # type: ignore[no-any-return]
-
-
-def connected(x: Spikes, synapses: Synapses, beside: Sequence[Spikes] = ()) -> list[Tensor]:
-    """Products ``[T, B, O]`` of fully connected layers for ``[T, B, K]``, or for images ``[T, B, H, W, C]`` that are
-    flattened in the order ``[C, H, W]``; and after them those of others with the same weights, without gradient."""
-    everyone = (*beside, x)
-    if x.bits is None:
-        ys = []
-        for one in everyone:
-            with torch.set_grad_enabled(one is x and torch.is_grad_enabled()):
-                ys.append(_Linear.apply(_flat(one), synapses, *synapses.parameters))  # type: ignore[no-untyped-call]
+    steps, batch, *sides, _ = x.memory.shape
+    weight, stride = synapses.weight, synapses.stride
+    outputs, _, kernel, _ = weight.shape
+    places = [out_side(side, kernel, stride) for side in sides]
+    images = x.memory.flatten(0, 1)
+    if x.is_bits:
+        panels = Panels.of_windows(images, kernel, stride)
+        y = panels.times(synapses.matrix, synapses.bias)
     else:
-        panels = [Panels.of_images(cast(Tensor, one.bits).flatten(0, 1), one.numbers.shape[-1]) for one in everyone]
-        ys = _SpikeLinear.apply(_flat(x), synapses, panels, *synapses.parameters)  # type: ignore[no-untyped-call]
-    *others, y = (y.unflatten(0, one.numbers.shape[:2]) for y, one in zip(ys, everyone, strict=True))
-    return [y, *others]
+        numbers_ICHW = images.permute(0, 3, 1, 2)
+        y = convolution(numbers_ICHW, weight, synapses.bias, stride).permute(0, 2, 3, 1)
+
+    def gradients(grad_y: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
+        # Two gradients are asked for one by one: together, oneDNN takes up to 1.4 times as long.
+        grad_x, grad_IOhw = None, grad_y.view(-1, *places, outputs).permute(0, 3, 1, 2)
+        if of_inputs:
+            grad_ICHW = convolution_input_gradient(grad_IOhw, weight, stride, sides)
+            grad_x = channels_last(grad_ICHW).permute(0, 2, 3, 1)
+        if not x.is_bits:
+            return grad_x, [*convolution_weight_gradient(numbers_ICHW, grad_IOhw, weight, stride)]
+        grad_matrix, grad_bias = panels.gradients(grad_y.view(-1, outputs))
+        grad_OkkC = grad_matrix.view(outputs, kernel, kernel, -1)[..., : x.channels]
+        return grad_x, [grad_OkkC.permute(0, 3, 1, 2), grad_bias]
+
+    return y.view(steps, batch, *places, outputs), gradients
 
 
-def _flat(x: Spikes) -> Tensor:
-    return x.numbers.flatten(0, 1).movedim(-1, 1).flatten(1)
+def connected(xs: Sequence[Spikes], synapses: Synapses) -> tuple[list[Tensor], Gradients]:
+    """Products ``[T, B, O]`` of fully connected layers for each of some inputs ``[T, B, K]``, or images
+    ``[T, B, H, W, C]`` that are flattened in the order ``[C, H, W]``. Gradients are those of the first one."""
+    if xs[0].is_bits:
+        return _connected_bits(xs, synapses)
+    flats = [_flat(x.memory) for x in xs]
+    ys = [F.linear(flat, synapses.weight, synapses.bias.to(flat.dtype)) for flat in flats]
+
+    def gradients(grad_y: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
+        grad_y = grad_y.view(ys[0].shape)
+        weight, bias = (grad_y.T @ flats[0]).to(torch.float32), grad_y.sum(0, dtype=torch.float32)
+        return _input_gradient(xs[0], grad_y, synapses, of_inputs), _by_layer(synapses, weight, bias)
+
+    return [y.view(*x.memory.shape[:2], -1) for x, y in zip(xs, ys, strict=True)], gradients
 
 
-def _words(bits: Tensor) -> int:
-    """Where they lie; ValueError for what C++ would read wrongly."""
-    if bits.dtype != torch.int32 or not bits.is_cpu or not bits.is_contiguous():
-        raise ValueError(f"{bits.dtype} with strides {bits.stride()} on {bits.device}, expected contiguous int32 words")
-    return bits.data_ptr()
+def _connected_bits(xs: Sequence[Spikes], synapses: Synapses) -> tuple[list[Tensor], Gradients]:
+    """All inputs' panels lie one after the other, so they are multiplied with the same tables."""
+    images = [x.memory.flatten(0, 1) for x in xs]
+    counts = [-(-len(part) // _LANES) for part in images]
+    joint = Panels.empty(sum(counts) * _LANES, synapses.matrix.shape[1])
+    parts = [
+        Panels.of_images(part, x.channels, words)
+        for part, x, words in zip(images, xs, joint.words.split(counts), strict=True)
+    ]
+    rows = joint.times(synapses.matrix, synapses.bias).split([count * _LANES for count in counts])
+    ys = [some[: part.lanes].view(*x.memory.shape[:2], -1) for some, part, x in zip(rows, parts, xs, strict=True)]
+
+    def gradients(grad_y: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
+        grad_y = grad_y.view(parts[0].lanes, -1)
+        grad_x = _input_gradient(xs[0], grad_y, synapses, of_inputs)
+        return grad_x, _by_layer(synapses, *parts[0].gradients(grad_y))
+
+    return ys, gradients
 
 
-# All of them take the layers' parameters last: they get the gradients, and what was made of them is read.
-
-
-class _SpikeConvolution(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, numbers: Tensor, synapses: Synapses, panels: Panels, *parameters: Tensor) -> Tensor:
-        ctx.synapses, ctx.panels, ctx.sides = synapses, panels, numbers.shape[2:]
-        return panels.times(synapses.matrix, synapses.bias)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        grad_y, weight, stride = gradients[0].contiguous(), ctx.synapses.weight, ctx.synapses.stride
-        out_channels, channels, kernel, _ = weight.shape
-        places = [out_side(side, kernel, stride) for side in ctx.sides]
-        grad_y_IOhw = grad_y.view(-1, *places, out_channels).permute(0, 3, 1, 2)
-        grad_x = convolution_input_gradient(grad_y_IOhw, weight, stride, ctx.sides)
-        grad_weight, grad_bias = ctx.panels.gradients(grad_y)
-        grad_OkkC = grad_weight.view(out_channels, kernel, kernel, -1)[..., :channels]
-        return grad_x, None, None, grad_OkkC.permute(0, 3, 1, 2), grad_bias
-
-
-class _SpikeLinear(torch.autograd.Function):
-    """Of several panels, with the same tables; the gradient is the last one's."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, numbers: Tensor, synapses: Synapses, panels: Sequence[Panels], *parameters: Tensor
-    ) -> tuple[Tensor, ...]:
-        ctx.synapses, ctx.panels = synapses, panels[-1]
-        ctx.set_materialize_grads(False)
-        words = torch.cat([part.words for part in panels])
-        y = Panels(words, len(words) * _LANES, panels[-1].bits).times(synapses.matrix, synapses.bias)
-        rows = y.split([len(part.words) * _LANES for part in panels])
-        parts = tuple(some[: part.lanes] for some, part in zip(rows, panels, strict=True))
-        ctx.mark_non_differentiable(*parts[:-1])
-        return parts
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        grad_y = gradients[-1].contiguous()
-        grad_x = matrix_product(grad_y, ctx.synapses.weight)
-        return grad_x, None, None, *_by_layer(ctx.synapses, *ctx.panels.gradients(grad_y))
+def _input_gradient(x: Spikes, grad_y: Tensor, synapses: Synapses, is_asked: bool) -> Tensor | None:
+    """Of fully connected layers, with channels innermost."""
+    if not is_asked:
+        return None
+    grad_IK, places = matrix_product(grad_y, synapses.weight), x.memory.shape[2:-1]
+    return grad_IK.view(len(grad_IK), x.channels, *places).movedim(1, -1).contiguous()
 
 
 def _by_layer(synapses: Synapses, grad_weight: Tensor, grad_bias: Tensor) -> list[Tensor]:
@@ -242,32 +249,12 @@ def _by_layer(synapses: Synapses, grad_weight: Tensor, grad_bias: Tensor) -> lis
     return [gradient for pair in pairs for gradient in pair]
 
 
-class _Convolution(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, synapses: Synapses, *parameters: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        ctx.synapses = synapses
-        return convolution(x, synapses.weight, synapses.bias, synapses.stride)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        # Its two gradients are asked for one by one: together, oneDNN takes up to 1.4 times as long.
-        (x,), (grad_y,), (weight, stride) = ctx.saved_tensors, gradients, (ctx.synapses.weight, ctx.synapses.stride)
-        is_asked = ctx.needs_input_grad[0]
-        grad_x = convolution_input_gradient(grad_y, weight, stride, x.shape[2:]) if is_asked else None
-        return grad_x, None, *convolution_weight_gradient(x, grad_y, weight, stride)
+def _flat(numbers: Tensor) -> Tensor:
+    return numbers.flatten(0, 1).movedim(-1, 1).flatten(1)
 
 
-class _Linear(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, synapses: Synapses, *parameters: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        ctx.synapses = synapses
-        return F.linear(x, synapses.weight, synapses.bias.to(x.dtype))
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (x,), (grad_y,) = ctx.saved_tensors, gradients
-        grad_x = matrix_product(grad_y, ctx.synapses.weight) if ctx.needs_input_grad[0] else None
-        both = (grad_y.T @ x).to(torch.float32), grad_y.sum(0, dtype=torch.float32)
-        return grad_x, None, *_by_layer(ctx.synapses, *both)
+def _words(bits: Tensor) -> int:
+    """Where they lie; ValueError for what C++ would read wrongly."""
+    if bits.dtype != torch.int32 or not bits.is_cpu or not bits.is_contiguous():
+        raise ValueError(f"{bits.dtype} with strides {bits.stride()} on {bits.device}, expected contiguous int32 words")
+    return bits.data_ptr()

@@ -258,7 +258,7 @@ class QNetwork(nn.Module):
             name: self._readout(name, cast(Stream, stream), features_TBN, context[name], state, activity, precision)
             for name, stream in self.streams.items()
         }
-        return self.combine(outputs)
+        return self.highest(self.combine(outputs))
 
     def _over_time(self, current: Tensor) -> Tensor:
         """Repeat ``[1, B, ...]`` over T: direct encoding's first layer has the same current at every step."""
@@ -290,25 +290,27 @@ class QNetwork(nn.Module):
         precision: torch.dtype | None,
     ) -> Tensor:
         spikes_TBN = self._fire(name, stream, stream.current(features_TBN, context, precision), state, activity)
-        return self.read_out(stream, spikes_TBN)
-
-    def read_out(self, stream: Stream, spikes_TBN: Tensor) -> Tensor:
-        """A stream's output: ``[B, outputs]`` (mean, last_membrane) or ``[T, B, outputs]`` (max_membrane)."""
         if self.config.readout == "mean":
             return cast(Tensor, stream.head(spikes_TBN.mean(0)))
-        outputs_t = stream.head(spikes_TBN)
-        membranes = [outputs_t[0]]
-        for output_t in outputs_t[1:]:
-            membranes.append(self.config.readout_beta * membranes[-1] + output_t)
+        return self.integrate(stream.head(spikes_TBN))
+
+    def integrate(self, outputs_TBN: Tensor) -> Tensor:
+        """Membranes of the readout's neurons, which never fire, on a head's outputs: the last one ``[B, N]``, or all
+        ``[T, B, N]`` (max_membrane)."""
+        membranes = [outputs_TBN[0]]
+        for output_BN in outputs_TBN[1:]:
+            membranes.append(self.config.readout_beta * membranes[-1] + output_BN)
         return membranes[-1] if self.config.readout == "last_membrane" else torch.stack(membranes)
 
     def combine(self, outputs: dict[str, Tensor]) -> Tensor:
-        """Q-values ``[B, A]`` from the streams' outputs."""
+        """Q-values ``[..., A]`` from the streams' outputs ``[..., n]``."""
         if "q" in outputs:
-            q = outputs["q"]
-        else:
-            advantage = outputs["advantage"]
-            q = outputs["value"] + advantage - advantage.mean(-1, keepdim=True)
+            return outputs["q"]
+        advantage = outputs["advantage"]
+        return outputs["value"] + advantage - advantage.mean(-1, keepdim=True)
+
+    def highest(self, q: Tensor) -> Tensor:
+        """Q-values ``[B, A]`` of those that :meth:`integrate` leaves."""
         return q.amax(0) if self.config.readout == "max_membrane" else q
 
     def neuron_layers(self) -> Iterator[str]:
