@@ -175,16 +175,22 @@ void snn_windows(const uint32_t* spikes, uint32_t* panels, long images, long hei
     long down = (height - kernel) / stride + 1, across = (width - kernel) / stride + 1;
     long lanes = images * down * across, size = kernel * kernel * words;
 #pragma omp parallel for schedule(static) num_threads(threads)
-    for (long p = 0; p < (lanes + LANES - 1) / LANES; p++)
-        for (long l = 0; l < LANES; l++) {
-            uint32_t* to = panels + p * size * LANES + l;
+    for (long p = 0; p < (lanes + LANES - 1) / LANES; p++) {
+        const uint32_t* windows[LANES];
+        long count = std::min(LANES, lanes - p * LANES);
+        for (long l = 0; l < count; l++) {
             long n = p * LANES + l, image = n / (down * across);
             long y = n / across % down * stride, x = n % across * stride;
-            for (long dy = 0; dy < kernel; dy++) {
-                const uint32_t* row = spikes + ((image * height + y + dy) * width + x) * words;
-                for (long i = 0; i < kernel * words; i++, to += LANES) *to = n < lanes ? row[i] : 0;
-            }
+            windows[l] = spikes + ((image * height + y) * width + x) * words;
         }
+        uint32_t* to = panels + p * size * LANES;
+        for (long dy = 0; dy < kernel; dy++)
+            for (long i = 0; i < kernel * words; i++, to += LANES) {
+                long away = dy * width * words + i;
+                for (long l = 0; l < count; l++) to[l] = windows[l][away];
+                std::fill(to + count, to + LANES, 0u);
+            }
+    }
 }
 
 // Panels of whole images, one per lane: bit c * places + p. spikes [images][places][words of channels].
