@@ -231,6 +231,9 @@ void snn_matrix_product(const BFloat16* a, const BFloat16* b, BFloat16* out, lon
         for (long n = 0; n < N; n += CHANNELS) {
             for (long k = 0; k < K; k += 2) pack(b + k * N + n, b + (k + 1) * N + n, packed.data() + k * CHANNELS);
             in_parts(M, [&](long m, long count) {
+                // The next columns, while these are worked on: each row's part lies in another page.
+                if (n + CHANNELS < N)
+                    for (long k = K * m / M; k < K * (m + count) / M; k++) __builtin_prefetch(b + k * N + n + CHANNELS);
                 Tile{a + m * K, K, 0, 2, packed.data(), 1, K / 2}.put(count, nullptr, out + m * N + n, N);
             });
         }

@@ -140,6 +140,9 @@ void multiply(const A* a, B* bias, const uint32_t* panels, C* out, long M, long 
                     std::fill(some + r * CHUNK + (r < here ? real : 0), some + r * CHUNK + bits, 0.0f);
                 for (long r = 0; r < here && LANES_FIRST; r++)
                     for (long i = 0; i < real; i++) some[r * CHUNK + i] = number(a[(m + r) * K + k + i]);
+                if (LANES_FIRST && m + 2 * ROWS <= M)
+                    for (long r = 0; r < ROWS; r++)
+                        for (long i = 0; i < real; i += 64 / sizeof(A)) __builtin_prefetch(a + (m + ROWS + r) * K + k + i);
                 for (long i = 0; i < real && !LANES_FIRST; i++)
                     for (long r = 0; r < here; r++) some[r * CHUNK + i] = number(a[(k + i) * M + m + r]);
                 for (long r = 0; r < ROWS && !LANES_FIRST; r++)
