@@ -100,6 +100,13 @@ def test_convolutions_and_all_their_gradients(batch, channels, sides, kernel, st
     assert gradients(weights, False)[0] is None
 
 
+def test_a_large_gradient_goes_around_the_caches() -> None:
+    spikes, grad_y = random_spikes(70, 1, 3215), torch.randn(70, 330)
+    grad_weight, _ = Panels.of_images(as_bits(spikes), 3215).gradients(grad_y)
+    assert grad_weight.numel() >= 2**20
+    close(grad_weight, grad_y.double().T @ spikes.flatten(1).double(), False)
+
+
 @pytest.mark.parametrize(("lanes", "outputs"), [(700, 52), (2500, 3)])
 def test_any_number_of_threads_gives_the_same_bits(lanes: int, outputs: int) -> None:
     """Whether outputs or, where those are few, lanes are divided among them."""
