@@ -255,6 +255,23 @@ void images(const uint8_t* x, float scale, Y* out, long batch, long channels, lo
         }
 }
 
+// [images][channels][places] to [images][places][channels].
+template <class X>
+void channels_last(const X* x, X* out, long images, long channels, long places, int threads) {
+    constexpr long BLOCK = 32;
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (long i = 0; i < images; i++)
+        for (long c = 0; c < channels; c += BLOCK) {
+            auto turn = [=](long width) {
+                const X* from = x + (i * channels + c) * places;
+                X* to = out + i * places * channels + c;
+                for (long p = 0; p < places; p++, to += channels)
+                    for (long j = 0; j < width; j++) to[j] = from[j * places + p];
+            };
+            channels - c >= BLOCK ? turn(BLOCK) : turn(channels - c);
+        }
+}
+
 // f(...) with the constants and types that a call asks for.
 template <class F>
 void with_flag(bool flag, F f) {
@@ -362,5 +379,12 @@ void snn_moments(const void* y, int y_low, float* mean, float* variance, float* 
 void snn_images(const uint8_t* x, float scale, void* out, int out_low, long batch, long channels, long places,
                 int threads) {
     with_type(out_low, [&](auto o_) { images(x, scale, (decltype(o_)*)out, batch, channels, places, threads); });
+}
+
+void snn_channels_last(const void* x, int low, void* out, long images, long channels, long places, int threads) {
+    with_type(low, [&](auto x_) {
+        using X = decltype(x_);
+        channels_last((const X*)x, (X*)out, images, channels, places, threads);
+    });
 }
 }

@@ -43,6 +43,7 @@ _ARGUMENTS = {
     "snn_unfire": "ppilppilpppllli",
     "snn_moments": "pippppflli",
     "snn_images": "pfpillli",
+    "snn_channels_last": "pipllli",
     "snn_gains": "pllllipl",
     "snn_gains_gradient": "pllllippl",
     "snn_heads": "plppll",

@@ -239,7 +239,12 @@ def _input_gradient(x: Spikes, grad_y: Tensor, synapses: Synapses, is_asked: boo
     if not is_asked:
         return None
     grad_IK, places = matrix_product(grad_y, synapses.weight), x.memory.shape[2:-1]
-    return grad_IK.view(len(grad_IK), x.channels, *places).movedim(1, -1).contiguous()
+    if not places:
+        return grad_IK
+    grad_IPC = torch.empty(len(grad_IK), *places, x.channels, dtype=grad_IK.dtype)
+    sizes = (len(grad_IK), x.channels, math.prod(places), torch.get_num_threads())
+    library().snn_channels_last(*typed(grad_IK), grad_IPC.data_ptr(), *sizes)
+    return grad_IPC
 
 
 def _by_layer(synapses: Synapses, grad_weight: Tensor, grad_bias: Tensor) -> list[Tensor]:
