@@ -6,6 +6,8 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <memory>
+#include <utility>
 #include <vector>
 
 #include "native_numbers.h"
@@ -44,9 +46,7 @@ struct Tile {
                 __m512bh w_low = (__m512bh)_mm512_loadu_si512(w), w_high = (__m512bh)_mm512_loadu_si512(w + CHANNELS);
                 const BFloat16* x = from + r * row + p * pair;
                 for (int i = 0; i < COUNT; i++) {
-                    int32_t both;
-                    std::memcpy(&both, x + i * place, 4);
-                    __m512bh repeated = (__m512bh)_mm512_set1_epi32(both);
+                    __m512bh repeated = repeat(x + i * place);
                     lows[i] = _mm512_dpbf16_ps(lows[i], w_low, repeated);
                     highs[i] = _mm512_dpbf16_ps(highs[i], w_high, repeated);
                 }
@@ -64,13 +64,62 @@ struct Tile {
         }
     }
 
+    // As sum_of(LARGEST or fewer), for a whole line whose ends are padded: of the TAPS blocks of a row's pairs, block k is
+    // left out where it sees nothing but padding, at the first TAPS - 1 - k and the last k places.
+    template <int TAPS, class Put, int COUNT = LARGEST>
+    void line(long count, Put put) const {
+        if constexpr (COUNT >= TAPS) {
+            if (count != COUNT) return line<TAPS, Put, COUNT - 1>(count, put);
+            __m512 lows[COUNT], highs[COUNT];
+            for (int i = 0; i < COUNT; i++) lows[i] = highs[i] = _mm512_setzero_ps();
+            const BFloat16* w = weights;
+            for (long r = 0; r < rows; r++)
+                blocks(std::make_integer_sequence<int, TAPS>(), [&](auto k) {
+                    constexpr int first = TAPS - 1 - decltype(k)::value, end = COUNT - decltype(k)::value;
+                    const BFloat16* x = from + r * row + decltype(k)::value * (pairs / TAPS) * pair;
+                    for (long p = 0; p < pairs / TAPS; p++, w += PAIR, x += pair) {
+                        __m512bh w_low = (__m512bh)_mm512_loadu_si512(w);
+                        __m512bh w_high = (__m512bh)_mm512_loadu_si512(w + CHANNELS);
+                        for (int i = first; i < end; i++) {
+                            __m512bh repeated = repeat(x + i * place);
+                            lows[i] = _mm512_dpbf16_ps(lows[i], w_low, repeated);
+                            highs[i] = _mm512_dpbf16_ps(highs[i], w_high, repeated);
+                        }
+                    }
+                });
+            for (int i = 0; i < COUNT; i++) put(i, lows[i], highs[i]);
+        }
+    }
+
+    template <int... K, class Block>
+    static void blocks(std::integer_sequence<int, K...>, Block block) {
+        (block(std::integral_constant<int, K>()), ...);
+    }
+
+    static __m512bh repeat(const BFloat16* pair) {
+        int32_t both;
+        std::memcpy(&both, pair, 4);
+        return (__m512bh)_mm512_set1_epi32(both);
+    }
+
+    static auto rounded(BFloat16* to, long to_place) {
+        return [=](int i, __m512 a, __m512 b) {
+            _mm512_storeu_si512(to + i * to_place, (__m512i)_mm512_cvtne2ps_pbh(b, a));
+        };
+    }
+
     // Rounded, to places of their own, from a bias on.
     void put(long count, const float* bias, BFloat16* to, long to_place) const {
         __m512 low = bias ? _mm512_loadu_ps(bias) : _mm512_setzero_ps();
         __m512 high = bias ? _mm512_loadu_ps(bias + 16) : _mm512_setzero_ps();
-        sum_of(count, low, high, [=](int i, __m512 a, __m512 b) {
-            _mm512_storeu_si512(to + i * to_place, (__m512i)_mm512_cvtne2ps_pbh(b, a));
-        });
+        sum_of(count, low, high, rounded(to, to_place));
+    }
+
+    // The same for a line (see there) without a bias; false for what it has no code for.
+    bool put_line(long count, long taps, BFloat16* to, long to_place) const {
+        if (count > LARGEST || count < taps || taps < 2 || taps > 3) return false;
+        taps == 2 ? line<2>(count, rounded(to, to_place)) : line<3>(count, rounded(to, to_place));
+        return true;
     }
 
     // Added to sums [count][CHANNELS].
@@ -160,7 +209,8 @@ void snn_input_gradient(const BFloat16* grad_y, const BFloat16* weights, BFloat1
                                      packed.data() + (part * taps + above) * row_pairs * PAIR,
                                      std::min(taps, down + taps - 1 - i) - above, row_pairs};
                         BFloat16* to = grad_x + ((image * height * stride + y) * width * stride + x) * C;
-                        tile.put(count, nullptr, to + block * CHANNELS, stride * C);
+                        if (count < width || !tile.put_line(count, taps, to + block * CHANNELS, stride * C))
+                            tile.put(count, nullptr, to + block * CHANNELS, stride * C);
                     });
         }
     }
@@ -175,7 +225,8 @@ void snn_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_
     long blocks = O / CHANNELS, depth = kernel * C, step = stride * C, size = kernel * depth;
     long row = (width * C + CHANNELS - 1) / CHANNELS * PAIR;
     long groups = std::min(images, 16L);  // summed apart
-    std::vector<float> sums(groups * (size + 1) * O);  // [group][block][kernel row, its inputs; bias][CHANNELS]
+    long all = (size + 1) * O;
+    std::unique_ptr<float[]> sums(new float[groups * all]);  // [group][block][kernel row, its inputs; bias][CHANNELS]
 #pragma omp parallel num_threads(threads)
     {
         std::vector<BFloat16> line(row / 2 + step + CHANNELS);
@@ -183,7 +234,8 @@ void snn_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_
         std::vector<BFloat16> outputs(down * window_pairs * PAIR);      // [h][pair][CHANNELS][2]
         const BFloat16 zeros[CHANNELS] = {};
 #pragma omp for schedule(static)
-        for (long group = 0; group < groups; group++)
+        for (long group = 0; group < groups; group++) {
+            std::fill_n(sums.get() + group * all, all, 0.0f);
             for (long image = images * group / groups; image < images * (group + 1) / groups; image++) {
                 for (long i = 0; i < height; i++) {
                     std::copy_n(x + (image * height + i) * width * C, width * C, line.data());
@@ -191,7 +243,7 @@ void snn_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_
                         pack(line.data() + k, line.data() + k + step, inputs.data() + i * row + k * 2);
                 }
                 for (long block = 0; block < blocks; block++) {
-                    float* to = sums.data() + (group * blocks + block) * (size + 1) * CHANNELS;
+                    float* to = sums.get() + group * all + block * (size + 1) * CHANNELS;
                     Lanes low = load(to + size * CHANNELS, WIDTH), high = load(to + size * CHANNELS + WIDTH, WIDTH);
                     for (long i = 0; i < down; i++)
                         for (long j = 0; j < across; j += 2) {
@@ -210,15 +262,16 @@ void snn_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_
                         });
                 }
             }
-#pragma omp for schedule(static)
-        for (long o = 0; o < O; o++) {
-            for (long k = 0; k <= size; k++) {
-                float sum = 0.0f;
-                for (long group = 0; group < groups; group++)
-                    sum += sums[((group * blocks + o / CHANNELS) * (size + 1) + k) * CHANNELS + o % CHANNELS];
-                (k < size ? grad_weights[o * size + k] : grad_bias[o]) = sum;
-            }
         }
+#pragma omp for schedule(static)
+        for (long k = 0; k <= size; k++)
+            for (long o = 0; o < O; o += WIDTH) {
+                const float* from = sums.get() + (o / CHANNELS * (size + 1) + k) * CHANNELS + o % CHANNELS;
+                Lanes sum = {};
+                for (long group = 0; group < groups; group++) sum += load(from + group * all, WIDTH);
+                for (long i = 0; i < WIDTH; i++)
+                    (k < size ? grad_weights[(o + i) * size + k] : grad_bias[o + i]) = sum[i];
+            }
     }
 }
 
