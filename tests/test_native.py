@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import gc
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,7 @@ from switchmt_snn.learning.native_adam import NativeAdam
 from switchmt_snn.spiking import native_library
 from switchmt_snn.spiking.native import Currents, Neurons, batch_moments, scaled_images
 from switchmt_snn.spiking.native_network import NativeNetwork
-from switchmt_snn.spiking.network import ObservationSpec, build_network
+from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
 from switchmt_snn.spiking.neurons import SpikingLayer
 from tests.conftest import small_config
 
@@ -83,7 +86,13 @@ def test_every_form_has_the_same_spikes(channels: int) -> None:
     assert torch.equal(neurons.fire(y, currents, "numbers")[0], floats.bfloat16())
     unpacked = (neurons.fire(y, currents, "bits")[0][..., None] >> torch.arange(32)) & 1
     assert torch.equal(unpacked.flatten(2), F.pad(floats, (0, -channels % 32)).int())
-    assert torch.equal(neurons.fire(y, currents, "mean")[0], floats.mean(0, keepdim=True))
+    mean, currents_4C = neurons.fire(y, currents, "mean")
+    assert torch.equal(mean, floats.mean(0, keepdim=True))
+    shared = torch.randn(1, 21, channels).expand(3, -1, -1)
+    for ours, theirs in zip(
+        neurons.unfire(y, currents_4C, shared), neurons.unfire(y, currents_4C, shared.contiguous()), strict=True
+    ):
+        assert torch.equal(ours, theirs)
 
 
 @builds
@@ -136,6 +145,8 @@ def test_running_moments_move_as_in_batch_norm(steps: int, rows: int) -> None:
     torch.testing.assert_close((mean_C, var_C), theirs, rtol=1e-5, atol=1e-6)
     with pytest.raises(ValueError, match="expected float32 for 37 channels"):
         batch_moments(y, (mean_C.double(), var_C), 0.3)
+    with pytest.raises(ValueError, match="one row, expected two"):
+        batch_moments(y[:1, :1], (mean_C, var_C), 0.3)
 
 
 @builds
@@ -162,6 +173,9 @@ def test_what_cplusplus_would_read_wrongly_is_refused() -> None:
     for gain_C in (ones.double(), torch.ones(1)):
         with pytest.raises(ValueError, match="expected float32 for 8 channels"):
             neurons.fire(torch.zeros(4, 5, 8), Currents(gain_C), "floats")
+    for grad in (torch.zeros(1, 5, 8), torch.zeros(4, 5, 8).bfloat16()):
+        with pytest.raises(ValueError, match=r"gradient .*expected float32"):
+            neurons.unfire(torch.zeros(4, 5, 8), torch.zeros(4, 8), grad)
 
 
 @builds
@@ -187,19 +201,72 @@ def test_a_target_is_read_anew_after_its_copy() -> None:
     config = small_config(network={"trunk": "minatar"}).network
     network, target = build_network(config, spec, 1), build_network(config, spec, 2).requires_grad_(False)
     native = NativeNetwork(target, torch.bfloat16)
-    before = native.weights(1)
-    assert native.weights(1) is before
+    before = native.view(1)
+    assert native.view(1) is before
     gain_N = before.gain_N.clone()
     target.load_state_dict(network.state_dict())
     learning = NativeNetwork(network, torch.bfloat16)
-    after, fresh = native.weights(1), learning.weights(1)
+    after, fresh = native.view(1), learning.view(1)
     assert not torch.equal(after.gain_N, gain_N)
     assert torch.equal(after.gain_N, fresh.gain_N)
-    assert not torch.equal(after.gain_N, native.weights(0).gain_N)
+    assert not torch.equal(after.gain_N, native.view(0).gain_N)
     assert len(native.copies) == 5  # a convolution's weight, two streams' weights and biases
     for ours, theirs in zip(native.copies.items(), learning.copies.items(), strict=True):
         assert torch.equal(ours[0], theirs[0])
         assert torch.equal(ours[1], theirs[1])
+
+
+def decision(readout: str) -> tuple[QNetwork, NativeNetwork, Tensor]:
+    """A network, natively; and its inputs."""
+    settings_ = {"trunk": "minatar", "readout": readout, "threshold": 0.2}
+    network = build_network(
+        small_config(network=settings_).network, ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), 1
+    )
+    native = NativeNetwork(network, None)
+    return network, native, native.inputs(torch.rand(5, 4, 10, 10), torch.Generator())
+
+
+@builds
+@pytest.mark.parametrize("readout", ["mean", "last_membrane", "max_membrane"])
+def test_a_decision_leaves_no_cycle_behind(readout: str) -> None:
+    """Its memory is free at once, not when Python looks for cycles."""
+    _, native, x = decision(readout)
+    held = weakref.ref(x)
+    gc.collect()
+    gc.disable()
+    try:
+        values = native.decide(x, native.view(0), training=True, beside=[x])
+        values[0].sum().backward()
+        del x, values
+        assert held() is None
+    finally:
+        gc.enable()
+
+
+@builds
+def test_a_way_back_is_gone_once_and_with_the_parameters_of_the_decision() -> None:
+    network, native, x = decision("mean")
+    parameters = list(network.parameters())
+    (q,) = native.decide(x, native.view(0), training=True)
+    (other,) = native.decide(x * 0.5, native.view(1), training=True)
+    late = torch.autograd.grad(q.square().sum(), parameters, retain_graph=True)
+    (q_again,) = native.decide(x, native.view(0), training=True)
+    for ours, theirs in zip(late, torch.autograd.grad(q_again.square().sum(), parameters), strict=True):
+        assert torch.equal(ours, theirs)
+    with pytest.raises(RuntimeError, match="a second way back"):
+        q.sum().backward()
+    with torch.no_grad():
+        parameters[0].add_(1.0)
+    with pytest.raises(RuntimeError, match="parameters have changed"):
+        other.sum().backward()
+
+
+@builds
+@pytest.mark.parametrize("task", [-1, 3])
+def test_a_task_that_there_is_not_is_refused(task: int) -> None:
+    _, native, _ = decision("mean")
+    with pytest.raises(IndexError, match=f"task {task}, expected 0 to 2"):
+        native.view(task)
 
 
 @builds
@@ -213,7 +280,7 @@ def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dty
         torch.optim.Adam(theirs.parameters(), lr=1e-2, eps=1e-5, fused=True),
     )
     for number in range(5):
-        native.weights(0)
+        native.view(0)
         for index, (our, their) in enumerate(zip(ours.parameters(), theirs.parameters(), strict=True)):
             grad = torch.randn(our.shape) * 10.0 ** (-index)
             grad = grad.contiguous(memory_format=torch.channels_last) if our.dim() == 4 and number % 2 else grad
@@ -225,9 +292,10 @@ def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dty
             optimizer.step()
         moved = [parameter._version > old for parameter, old in zip(ours.parameters(), before, strict=True)]
         assert moved.count(False) == 1
+        assert len(optimizers[0].state) == len(optimizers[1].state)
         assert native.copies_are_true()
-        for part, copy in native.copies.items():
-            assert torch.equal(copy, part.to(copy.dtype))
+        for part, written in native.copies.items():
+            assert torch.equal(written, part.to(written.dtype))
     our_state, their_state = (optimizer.state_dict()["state"] for optimizer in optimizers)
     assert our_state.keys() == their_state.keys()
     for (name, our), their in zip(ours.named_parameters(), theirs.parameters(), strict=True):
@@ -242,17 +310,30 @@ def test_adam_is_pytorchs_to_rounding_and_keeps_copies_true(precision: torch.dty
     assert not native.copies_are_true()
     optimizers[0].step()
     assert not native.copies_are_true()
-    native.weights(0)
+    native.view(0)
     assert native.copies_are_true()
-    assert all(torch.equal(copy, part.to(copy.dtype)) for part, copy in native.copies.items())
+    assert all(torch.equal(written, part.to(written.dtype)) for part, written in native.copies.items())
     with pytest.raises(ValueError, match="closure"):
         optimizers[0].step(lambda: 0.0)
     for optimizer, other in (optimizers, optimizers[::-1]):  # each goes on from the other's state
-        optimizer.load_state_dict(other.state_dict())
-    state = optimizers[0].state_dict()
+        optimizer.load_state_dict(copy.deepcopy(other.state_dict()))
+    state = copy.deepcopy(optimizers[0].state_dict())
     state["state"][0]["exp_avg"] = state["state"][0]["exp_avg"][:1]
     with pytest.raises(ValueError, match=r"exp_avg is .*expected that of a parameter"):
         optimizers[0].load_state_dict(state)
+    theirs.load_state_dict(ours.state_dict())
+    before = [parameter.clone() for parameter in ours.parameters()]
+    for optimizer in optimizers:  # as it was; and anew, where parameters lie elsewhere
+        optimizer.step()
+        optimizer.state.clear()
+    for parameter in ours.parameters():
+        parameter.data = parameter.data.clone()
+    for optimizer in optimizers:
+        optimizer.step()
+    for our, their, old in zip(ours.parameters(), theirs.parameters(), before, strict=True):
+        assert torch.equal(our, old) == (our.grad is None)
+        torch.testing.assert_close(our, their, rtol=1e-5, atol=1e-6)
+    assert optimizers[0].state_dict()["state"].keys() == optimizers[1].state_dict()["state"].keys()
 
 
 @pytest.mark.parametrize(

@@ -100,5 +100,7 @@ def test_what_cplusplus_would_read_wrongly_is_refused(spikes: Tensor) -> None:
     for action in (lambda: heads.outputs(spikes), lambda: heads.gradients(spikes, torch.zeros(1, 4, 6), 1.0)):
         with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 74\]"):
             action()
+    with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 3\]"):
+        Gains(streams_of(network_of().double())).of_task(0)
     with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 6\]"):
         heads.gradients(torch.zeros(1, 4, 74), torch.zeros(1, 4, 7), 1.0)

@@ -105,11 +105,11 @@ class NativeEvaluate:
         network, target = self.network, self.target
         x_next = target.inputs(following, generator)
         with torch.no_grad():
-            (next_BA,) = target.decide(x_next, target.weights(task), training=False)
+            (next_BA,) = target.decide(x_next, target.view(task), training=False)
         if self._double_q and self._is_random:
             x_next = network.inputs(following, generator)
         x, beside = network.inputs(observation, generator), [x_next] if self._double_q else []
-        q_BA, *choice = network.decide(x, network.weights(task), training=True, beside=beside)
+        q_BA, *choice = network.decide(x, network.view(task), training=True, beside=beside)
         return Values(q_BA, next_BA, *(choice or [next_BA]))
 
 

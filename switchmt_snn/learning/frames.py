@@ -164,8 +164,8 @@ class CompressedFrames:
             return None
         if not hasattr(self._of_thread, "decompressor"):
             self._of_thread.decompressor = zstandard.ZstdDecompressor()
-        raw = bytearray(self._of_thread.decompressor.decompress(content))
-        frames: npt.NDArray[np.uint8] = np.frombuffer(raw, np.uint8).reshape(-1, self._frame_bytes)
+        raw = np.frombuffer(self._of_thread.decompressor.decompress(content), np.uint8)
+        frames: npt.NDArray[np.uint8] = raw.reshape(-1, self._frame_bytes)[:count].copy()
         for index in range(1, count):
             np.bitwise_xor(frames[index], frames[index - 1], out=frames[index])
         return frames

@@ -32,27 +32,30 @@ class NativeAdam(torch.optim.Adam):
     """:class:`torch.optim.Adam` for float32 parameters on a CPU; its state is the same.
 
     Steps are those of ``fused=True`` to rounding. The copies of weights that a native network has are written in the
-    same pass.
+    same pass. Hooks of steps are not called.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float, eps: float, network: NativeNetwork) -> None:
         super().__init__(parameters, lr=lr, eps=eps, fused=True)
         self._network = network
-        self._tensors: ctypes.Array[_Tensor] | None = None
+        (group,) = self.param_groups
+        self._tensors = (_Tensor * len(group["params"]))()
+        self._found: list[dict[str, Any] | None] = [None] * len(group["params"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a state of this class or of :class:`torch.optim.Adam`.
 
         Raises:
-            ValueError: its moments are not those of the parameters.
+            ValueError: its moments are not those of the parameters; nothing is changed.
         """
-        super().load_state_dict(state_dict)
-        self._tensors = None
-        for parameter, state in self.state.items():
-            for name in ("exp_avg", "exp_avg_sq"):
+        (group,), (saved,) = self.param_groups, state_dict["param_groups"]
+        for number, parameter in zip(saved["params"], group["params"], strict=True):
+            state = state_dict["state"].get(number, {})
+            for name in state.keys() & {"exp_avg", "exp_avg_sq"}:
                 seen, expected = ((x.dtype, tuple(x.shape), x.stride()) for x in (state[name], parameter))
                 if seen != expected:
                     raise ValueError(f"{name} is {seen}, expected that of a parameter, {expected}")
+        super().load_state_dict(state_dict)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -65,41 +68,40 @@ class NativeAdam(torch.optim.Adam):
             raise ValueError("a closure, expected none: gradients are computed before a step")
         (group,) = self.param_groups
         were_true, held, moved = self._network.copies_are_true(), [], []  # held: what is pointed to must live
-        tensors = self._tensors = self._tensors or self._found(group["params"])
-        for tensor, parameter in zip(tensors, group["params"], strict=True):
+        for index, (tensor, parameter) in enumerate(zip(self._tensors, group["params"], strict=True)):
             tensor.gradient = None
-            if parameter.grad is not None:
-                gradient = _laid_out_like(parameter, parameter.grad)
-                tensor.gradient = gradient.data_ptr()
-                held.append(gradient)
-                moved.append(parameter)
+            if parameter.grad is None:
+                continue
+            state = self.state[parameter]
+            if state is not self._found[index] or tensor.parameter != parameter.data_ptr():
+                self._find(index, parameter, state)
+            gradient = _laid_out_like(parameter, parameter.grad)
+            tensor.gradient = gradient.data_ptr()
+            held.append(gradient)
+            moved.append(parameter)
         numbers = (group["lr"], *group["betas"], group["eps"])
-        library().snn_adam(ctypes.addressof(tensors), len(tensors), *numbers, torch.get_num_threads())
+        library().snn_adam(ctypes.addressof(self._tensors), len(self._tensors), *numbers, torch.get_num_threads())
         torch.autograd.graph.increment_version(moved)
         if were_true:
             self._network.note_true_copies()
 
-    # PyTorch would wrap it for hooks and profilers, which takes a hundredth of an update and is not used.
-    step.hooked = True  # type: ignore[attr-defined]
+    step.hooked = True  # type: ignore[attr-defined]  # else PyTorch wraps it, for hooks and profilers
 
-    def _found(self, parameters: list[Tensor]) -> ctypes.Array[_Tensor]:
-        """Where parameters, their state and copies lie, which stay there."""
-        tensors = (_Tensor * len(parameters))()
-        for tensor, parameter in zip(tensors, parameters, strict=True):
-            state: dict[str, Any] = self.state[parameter]
-            if not state:
-                state["step"] = torch.zeros(())
-                state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-                state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-            tensor.parameter, tensor.size = parameter.data_ptr(), parameter.numel()
-            places = [state[name].data_ptr() for name in ("exp_avg", "exp_avg_sq", "step")]
-            tensor.mean, tensor.square, tensor.step = places
-            tensor.places = 1
-            if (copy := self._network.copies.get(parameter)) is not None:
-                tensor.copy, tensor.low = copy.data_ptr(), copy.dtype == torch.bfloat16
-                if copy.stride() != parameter.stride():  # images with channels innermost
-                    tensor.channels, tensor.places = parameter.shape[1], parameter[0, 0].numel()
-        return tensors
+    def _find(self, index: int, parameter: Tensor, state: dict[str, Any]) -> None:
+        """Where a parameter, its state and its copy lie; they stay there until the state is another one."""
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+            state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+        self._found[index], tensor = state, self._tensors[index]
+        tensor.parameter, tensor.size = parameter.data_ptr(), parameter.numel()
+        places = [state[name].data_ptr() for name in ("exp_avg", "exp_avg_sq", "step")]
+        tensor.mean, tensor.square, tensor.step = places
+        tensor.places = 1
+        if (copy := self._network.copies.get(parameter)) is not None:
+            tensor.copy, tensor.low = copy.data_ptr(), copy.dtype == torch.bfloat16
+            if copy.stride() != parameter.stride():  # images with channels innermost
+                tensor.channels, tensor.places = parameter.shape[1], parameter[0, 0].numel()
 
 
 def _laid_out_like(parameter: Tensor, gradient: Tensor) -> Tensor:

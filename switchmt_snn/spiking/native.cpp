@@ -46,8 +46,8 @@ void make_currents(const float* a, const float* b, const float* mean, const floa
     }
 }
 
-// visit(t, v, membranes, spikes, which of them fired) for T steps of V vectors of one row's channels; the last vector may
-// be shorter. More than one is worked on at once because a step waits for the one before it.
+// visit(t, v, membranes, spikes, which of them fired) for T steps of V vectors of one row's channels; a single vector may
+// be shorter. Two are worked on at once because a step waits for the one before it.
 template <bool ZERO, int V, class Y, class F>
 inline void integrate(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, long steps, long width,
                       F visit) {

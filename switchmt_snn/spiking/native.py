@@ -119,8 +119,16 @@ class Neurons:
         """Gradients of ``y``, and ``[2, C]`` of the currents' a and b, from those of the spikes.
 
         Moments that the currents had are those of ``y``, and the gradient goes through them.
+
+        Raises:
+            ValueError: the gradient is not one of T steps, in float32 or the dtype of ``y``.
         """
         steps, rows, channels = y_SRC.shape
+        if grad_TRC.shape != (self.timesteps, rows, channels) or grad_TRC.dtype not in (torch.float32, y_SRC.dtype):
+            raise ValueError(
+                f"gradient {grad_TRC.dtype} {tuple(grad_TRC.shape)}, expected float32 or {y_SRC.dtype} "
+                f"{(self.timesteps, rows, channels)}"
+            )
         scratch_SRC, grad_y_SRC = torch.empty(steps, rows, channels), torch.empty_like(y_SRC)
         grad_2C = torch.empty(2, channels)
         if not (grad_TRC.stride(0) == 0 and grad_TRC[0].is_contiguous()):
@@ -152,10 +160,13 @@ def batch_moments(
     :meth:`~switchmt_snn.spiking.normalization.TaskBatchNorm.move` do.
 
     Raises:
-        ValueError: see :func:`_places`.
+        ValueError: running ones are not those of the channels (:func:`_places`), or there is a single row, which has no
+            variance to follow.
     """
     y_SRC = y_SRC.contiguous()
     steps, rows, channels = y_SRC.shape
+    if running is not None and steps * rows < 2:
+        raise ValueError("one row, expected two or more for a variance to follow")
     mean_C, variance_C = torch.empty(channels), torch.empty(channels)
     places = _places((mean_C, variance_C, *(running or (None, None))), channels)
     library().snn_moments(*typed(y_SRC), *places, momentum, steps * rows, channels, torch.get_num_threads())

@@ -117,7 +117,7 @@ struct Tile {
 
     // The same for a line (see there) without a bias; false for what it has no code for.
     bool put_line(long count, long taps, BFloat16* to, long to_place) const {
-        if (count > LARGEST || count < taps || taps < 2 || taps > 3) return false;
+        if (count < taps || taps < 2 || taps > 3) return false;
         taps == 2 ? line<2>(count, rounded(to, to_place)) : line<3>(count, rounded(to, to_place));
         return true;
     }

@@ -1,8 +1,7 @@
 """A network's decision through the native neuron layers: the same function as :meth:`QNetwork.decide`.
 
 Synaptic products are :mod:`switchmt_snn.spiking.native_products`', neurons :mod:`switchmt_snn.spiking.native`'s, and
-channels lie innermost. From the encoded inputs to the heads' outputs, autograd sees one operation: between some fifty
-calls into C++, what PyTorch's and Python's caches have lost is what takes time.
+channels lie innermost. For autograd, all from the encoded inputs to the heads' outputs is one operation.
 
 Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons
 of all streams, A actions.
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from switchmt_snn.spiking.native import Currents, Form, Neurons, Spikes, batch_moments, scaled_images
 from switchmt_snn.spiking.native_products import Gradients, Synapses, connected, convolved, spikes_as_bits
@@ -25,8 +25,8 @@ WayBack = Callable[[Tensor], list[Tensor]]
 """From the gradient of the heads' outputs to those of :attr:`NativeNetwork._differentiated`."""
 
 
-class Weights(NamedTuple):
-    """What a task changes, until the network's parameters change."""
+class TaskView(NamedTuple):
+    """What a task changes in a network, until its parameters change."""
 
     task: int
     gain_N: Tensor
@@ -67,7 +67,7 @@ class NativeNetwork:
         self._differentiated = (*of_trunk, *of_streams)
         self.copies = {part: copy for synapses in self._synapses for part, copy in synapses.copies.items()}
         self._copied_version = self._version = -1
-        self._by_task: dict[int, Weights] = {}
+        self._by_task: dict[int, TaskView] = {}
         self._contexts: dict[int, Context] = {}
 
     def inputs(self, observation: Tensor, generator: torch.Generator) -> Tensor:
@@ -84,14 +84,18 @@ class NativeNetwork:
         return self._version_now() == self._copied_version
 
     def note_true_copies(self) -> None:
-        """Who changed parameters has changed their copies as well; else :meth:`weights` makes them anew."""
+        """Who changed parameters has changed their copies as well; else :meth:`view` makes them anew."""
         self._copied_version = self._version_now()
 
     def _version_now(self) -> int:
         return sum(parameter._version for parameter in self._parameters)
 
-    def weights(self, task: int) -> Weights:
-        """For a task, as they are now; kept until they change."""
+    def view(self, task: int) -> TaskView:
+        """The network as a task sees it, its parameters as they are now.
+
+        Raises:
+            IndexError: there is no such task.
+        """
         version = self._version_now()
         if version != self._version:
             if version != self._copied_version:
@@ -101,55 +105,62 @@ class NativeNetwork:
             self._copied_version = self._version = version
             self._by_task = {}
         if task not in self._by_task:
+            gain_N = self._gains.of_task(task)
             if task not in self._contexts:
                 self._contexts[task] = self._network.context(task)  # views, which see changes
-            self._by_task[task] = Weights(task, self._gains.of_task(task), self._contexts[task])
+            self._by_task[task] = TaskView(task, gain_N, self._contexts[task])
         return self._by_task[task]
 
-    def decide(self, x: Tensor, weights: Weights, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
+    def decide(self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
         """Q-values ``[B, A]`` of :meth:`inputs`, normalised as ``training`` says; and after them those of other inputs,
         normalised by the running statistics. Only the first ones of training have a gradient."""
         if training and torch.is_grad_enabled():
-            outputs = _Decision.apply(self, x, weights, beside, *self._differentiated)  # type: ignore[no-untyped-call]
+            outputs = _Decision.apply(self, x, view, beside, *self._differentiated)  # type: ignore[no-untyped-call]
         else:
             with torch.no_grad():
-                outputs, _ = self._outputs(x, weights, training, beside)
+                outputs, _ = self._outputs(x, view, training, beside, None)
         if self._is_mean:
             return list(outputs)
         return [self._network.highest(self._network.integrate(output_TBA)) for output_TBA in outputs]
 
     def _outputs(
-        self, x: Tensor, weights: Weights, training: bool, beside: Sequence[Tensor]
+        self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor], layers: list[Gradients] | None
     ) -> tuple[list[Tensor], WayBack]:
-        """What the heads send on, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``; and the first one's way back."""
-        layers: list[Gradients] = []
-        others = [self._features(other, weights, training=False) for other in beside]  # first: training moves averages
-        ys, of_streams = connected([self._features(x, weights, training, layers), *others], self._streams)
-        currents, form = Currents(weights.gain_N), self._last_form
-        fired = [self._neurons.fire(y_TBN, currents, form) for y_TBN in ys]
+        """What the heads send on, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``; and the first one's way back, through
+        what is appended to ``layers``."""
+        others = [self._features(other, view, training=False) for other in beside]  # first: training moves averages
+        ys, of_streams = connected([self._features(x, view, training, layers), *others], self._streams)
+        fired = [self._neurons.fire(y_TBN, Currents(view.gain_N), self._last_form) for y_TBN in ys]
         outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
+        # The way back holds on to nothing of the others, nor to what it leads back from.
+        y_TBN, (spikes_SBN, currents_4N), shape = ys[0], fired[0], outputs[0].shape
+        task, version = view.task, self._version
 
         def way_back(grad: Tensor) -> list[Tensor]:
-            spikes_SBN, currents_4N = fired[0]
-            steps, grad_SBA = self._neurons.timesteps, grad.contiguous().view(outputs[0].shape)
+            if not layers:
+                raise RuntimeError("a second way back, expected one for each decision")
+            if self._version_now() != version:
+                raise RuntimeError("parameters have changed since the decision, expected its gradient first")
+            steps, grad_SBA = self._neurons.timesteps, grad.contiguous().view(shape)
             scale = 1.0 / steps if self._is_mean else 1.0
             grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBA, scale)
-            grad_y, (grad_gain_N, _) = self._neurons.unfire(ys[0], currents_4N, grad_SBN.expand(steps, -1, -1))
-            of_gains = self._gains.gradients(weights.task, grad_gain_N)
-            grad_x, of_synapses = of_streams(grad_y, bool(layers))
+            grad_y, (grad_gain_N, _) = self._neurons.unfire(y_TBN, currents_4N, grad_SBN.expand(steps, -1, -1))
+            of_gains = self._gains.gradients(task, grad_gain_N)
+            grad_x, of_synapses = of_streams(grad_y, True)
             parts = [*of_synapses, *of_gains, *of_heads]
             while layers:  # what a layer kept is let go
-                grad_x, of_layer = layers.pop()(cast(Tensor, grad_x), bool(layers))
-                parts = [*of_layer, *parts]
+                of_layer = layers.pop()
+                grad_x, some = of_layer(cast(Tensor, grad_x), bool(layers))
+                parts = [*some, *parts]
             return parts
 
         return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], way_back
 
-    def _features(self, x: Tensor, weights: Weights, training: bool, layers: list[Gradients] | None = None) -> Spikes:
-        """What the trunk sends to the streams; each layer's gradients are appended to ``layers``."""
+    def _features(self, x: Tensor, view: TaskView, training: bool, layers: list[Gradients] | None = None) -> Spikes:
+        """What the trunk sends to the streams; each layer's way back is appended to ``layers``, if there is one."""
         spikes = Spikes(x, x.shape[-1])
         for name, layer in self._trunk.items():
-            spikes, gradients = layer.fire(spikes, weights.context[name], training)
+            spikes, gradients = layer.fire(spikes, view.context[name], training)
             if layers is not None:
                 layers.append(gradients)
         return spikes
@@ -198,13 +209,14 @@ class _Layer:
 class _Decision(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, network: NativeNetwork, x: Tensor, weights: Weights, beside: Sequence[Tensor], *parameters: Tensor
+        ctx: Any, network: NativeNetwork, x: Tensor, view: TaskView, beside: Sequence[Tensor], *parameters: Tensor
     ) -> tuple[Tensor, ...]:
-        outputs, ctx.way_back = network._outputs(x, weights, True, beside)
+        outputs, ctx.way_back = network._outputs(x, view, True, beside, [])
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[1:])
         return tuple(outputs)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         return None, None, None, None, *ctx.way_back(gradients[0])

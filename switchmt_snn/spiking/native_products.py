@@ -204,12 +204,13 @@ def connected(xs: Sequence[Spikes], synapses: Synapses) -> tuple[list[Tensor], G
     if xs[0].is_bits:
         return _connected_bits(xs, synapses)
     flats = [_flat(x.memory) for x in xs]
-    ys = [F.linear(flat, synapses.weight, synapses.bias.to(flat.dtype)) for flat in flats]
+    ys = [F.linear(some, synapses.weight, synapses.bias.to(some.dtype)) for some in flats]
+    first, flat, shape = xs[0], flats[0], ys[0].shape
 
     def gradients(grad_y: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
-        grad_y = grad_y.view(ys[0].shape)
-        weight, bias = (grad_y.T @ flats[0]).to(torch.float32), grad_y.sum(0, dtype=torch.float32)
-        return _input_gradient(xs[0], grad_y, synapses, of_inputs), _by_layer(synapses, weight, bias)
+        grad_y = grad_y.view(shape)
+        weight, bias = (grad_y.T @ flat).to(torch.float32), grad_y.sum(0, dtype=torch.float32)
+        return _input_gradient(first, grad_y, synapses, of_inputs), _by_layer(synapses, weight, bias)
 
     return [y.view(*x.memory.shape[:2], -1) for x, y in zip(xs, ys, strict=True)], gradients
 
@@ -226,10 +227,12 @@ def _connected_bits(xs: Sequence[Spikes], synapses: Synapses) -> tuple[list[Tens
     rows = joint.times(synapses.matrix, synapses.bias).split([count * _LANES for count in counts])
     ys = [some[: part.lanes].view(*x.memory.shape[:2], -1) for some, part, x in zip(rows, parts, xs, strict=True)]
 
+    first, panels = xs[0], parts[0]
+
     def gradients(grad_y: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
-        grad_y = grad_y.view(parts[0].lanes, -1)
-        grad_x = _input_gradient(xs[0], grad_y, synapses, of_inputs)
-        return grad_x, _by_layer(synapses, *parts[0].gradients(grad_y))
+        grad_y = grad_y.view(panels.lanes, -1)
+        grad_x = _input_gradient(first, grad_y, synapses, of_inputs)
+        return grad_x, _by_layer(synapses, *panels.gradients(grad_y))
 
     return ys, gradients
 

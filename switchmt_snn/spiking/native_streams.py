@@ -8,14 +8,30 @@ Shapes: S steps of the spikes (T, or 1 for their mean), B batch, N neurons of al
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator, Sequence
-from typing import cast
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from switchmt_snn.spiking.native_library import library
 from switchmt_snn.spiking.network import QNetwork, Stream
+
+
+class _Dendrites(NamedTuple):
+    segments_NSK: Tensor
+    by_size: bool
+    """Whether the response that is largest in absolute value wins."""
+    first: int
+    """Of the stream's neurons among those of all streams."""
+    neurons: int
+
+    def what(self, task: int) -> tuple[int, ...]:
+        """Where the segments lie, how many there are, and how one wins; IndexError for a task that there is not."""
+        tasks = self.segments_NSK.shape[2]
+        if not 0 <= task < tasks:
+            raise IndexError(f"task {task}, expected 0 to {tasks - 1}")
+        return _numbers(self.segments_NSK, tasks), *self.segments_NSK.shape, task, self.by_size
 
 
 class Gains:
@@ -26,33 +42,40 @@ class Gains:
     """
 
     def __init__(self, streams: Sequence[Stream]) -> None:
-        self._sizes = [stream.synapses.out_features for stream in streams]
-        self._segments = [None if stream.dendrites is None else stream.dendrites.segments_NSK for stream in streams]
-        self._by_size = [stream.dendrites is not None and stream.dendrites.gating != "max" for stream in streams]
-        self.parameters = tuple(segments for segments in self._segments if segments is not None)
+        self._neurons, self._dendrites = 0, []
+        for stream in streams:
+            neurons = stream.synapses.out_features
+            if (dendrites := stream.dendrites) is not None:
+                by_size = dendrites.gating != "max"
+                self._dendrites.append(_Dendrites(dendrites.segments_NSK, by_size, self._neurons, neurons))
+            self._neurons += neurons
+        self.parameters = tuple(part.segments_NSK for part in self._dendrites)
 
     def of_task(self, task: int) -> Tensor:
-        """``[N]``, one stream after the other."""
-        gain_N = torch.ones(sum(self._sizes))
-        for segments, place, what, size in self._parts(gain_N, task):
-            library().snn_gains(segments.data_ptr(), *what, place, size)
+        """``[N]``, one stream after the other.
+
+        Raises:
+            IndexError: there is no such task.
+        """
+        gain_N = torch.ones(self._neurons)
+        for part in self._dendrites:
+            library().snn_gains(*part.what(task), gain_N.data_ptr() + part.first * 4, part.neurons)
         return gain_N
 
     def gradients(self, task: int, grad_gain_N: Tensor) -> list[Tensor]:
-        """Of :attr:`parameters`, from that of :meth:`of_task`."""
-        gradients = []
-        for segments, place, what, size in self._parts(grad_gain_N, task):
-            gradients.append(torch.empty_like(segments))
-            library().snn_gains_gradient(segments.data_ptr(), *what, place, gradients[-1].data_ptr(), size)
-        return gradients
+        """Of :attr:`parameters`, from that of :meth:`of_task`.
 
-    def _parts(self, numbers_N: Tensor, task: int) -> Iterator[tuple[Tensor, int, tuple[int, ...], int]]:
-        """Of each stream with dendrites: segments, where its numbers lie, its sizes and rule, its neurons."""
-        place = _numbers(numbers_N, sum(self._sizes))
-        for segments, size, by_size in zip(self._segments, self._sizes, self._by_size, strict=True):
-            if segments is not None:
-                yield segments, place, (*segments.shape, task, by_size), size
-            place += size * numbers_N.element_size()
+        Raises:
+            IndexError: there is no such task.
+            ValueError: the gradient is not contiguous float32 of all neurons.
+        """
+        gradients, place = [], _numbers(grad_gain_N, self._neurons)
+        for part in self._dendrites:
+            gradient = torch.empty_like(part.segments_NSK)
+            places = place + part.first * 4, gradient.data_ptr()
+            library().snn_gains_gradient(*part.what(task), *places, part.neurons)
+            gradients.append(gradient)
+        return gradients
 
 
 class _Head(ctypes.Structure):
@@ -86,16 +109,18 @@ class Heads:
         self._weight_AN, self._bias_A = torch.empty(actions, neurons), torch.empty(actions)
         self._heads = (_Head * len(layers))()
         for head, layer, combination in zip(self._heads, layers.values(), self._combinations, strict=True):
-            head.weight, head.bias = layer.weight.data_ptr(), layer.bias.data_ptr()
-            head.combination, head.inputs, head.outputs = (
-                combination.data_ptr(),
-                layer.in_features,
-                layer.out_features,
-            )
+            head.combination = combination.data_ptr()
+            head.inputs, head.outputs = layer.in_features, layer.out_features
 
     def read(self) -> None:
-        """Make the matrix that of the parameters as they are now."""
+        """Make the matrix that of the parameters as they are now.
+
+        Raises:
+            ValueError: they are not contiguous float32.
+        """
         actions, neurons = self._weight_AN.shape
+        for head, weight, bias in zip(self._heads, self.parameters[::2], self.parameters[1::2], strict=True):
+            head.weight, head.bias = _numbers(weight, head.inputs), _numbers(bias, head.outputs)
         places = self._weight_AN.data_ptr(), self._bias_A.data_ptr()
         library().snn_heads(ctypes.addressof(self._heads), len(self._heads), *places, neurons, actions)
 
