@@ -7,7 +7,6 @@ written slot after slot within a lane, and both give back the same bytes.
 from __future__ import annotations
 
 import functools
-import itertools
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
@@ -119,23 +118,36 @@ class CompressedFrames:
         """Frames ``[*slots.shape, *frame_shape]``; every block is decompressed once. A second thread takes half of them
         if PyTorch has more than one; more threads were not measured."""
         flat = slots.reshape(-1)
-        out = np.zeros((len(flat), self._frame_bytes), np.uint8)
+        out = np.empty((len(flat), self._frame_bytes), np.uint8)
         lanes, within = flat // self._slots, flat % self._slots
         blocks = np.where(flat < 0, -1, lanes * self._blocks_per_lane + within // self._block_slots)
-        offsets = within % self._block_slots
         order = np.argsort(blocks, kind="stable")
-        borders = np.flatnonzero(np.diff(blocks[order], prepend=-2, append=-2)).tolist()
+        blocks, offsets = blocks[order], (within % self._block_slots)[order]
+        starts = np.flatnonzero(np.diff(blocks, prepend=-2))
+        goes_on = (np.diff(order, prepend=-2) == 1) & (np.diff(offsets, prepend=-2) == 1)
+        goes_on[starts] = True
+        columns = (
+            blocks[starts],
+            starts,
+            np.append(starts, len(flat))[1:],
+            np.minimum.reduceat(offsets, starts),
+            np.maximum.reduceat(offsets, starts),
+            np.logical_and.reduceat(goes_on, starts),  # consecutive frames, for consecutive places of `out`
+        )
+        parts = list(zip(*(column.tolist() for column in columns), strict=True))
 
-        def read_blocks(parts: list[tuple[int, int]]) -> None:
-            for start, end in parts:
-                chosen = order[start:end]
-                block = int(blocks[chosen[0]])
-                if block >= 0:
-                    frames = self._frames_of(block, int(offsets[chosen].max()) + 1)
-                    if frames is not None:
-                        out[chosen] = frames[offsets[chosen]]
+        def read_blocks(parts: list[tuple[int, ...]]) -> None:
+            for block, start, end, first, last, is_run in parts:
+                places = order[start:end]
+                if block < 0:
+                    out[places] = 0
+                elif is_run:
+                    self._read_block(block, first, out[places[0] : places[0] + end - start])
+                else:
+                    frames = np.empty((last - first + 1, self._frame_bytes), np.uint8)
+                    self._read_block(block, first, frames)
+                    out[places] = frames[offsets[start:end] - first]
 
-        parts = list(itertools.pairwise(borders))
         if len(parts) <= _FEW_BLOCKS or torch.get_num_threads() == 1:
             read_blocks(parts)
         else:
@@ -153,22 +165,22 @@ class CompressedFrames:
                 self._compressed_bytes += sign * (len(stored) + _BYTES_OBJECT)
         self._blocks[block] = content
 
-    def _frames_of(self, block: int, count: int) -> npt.NDArray[np.uint8] | None:
-        """The first ``count`` frames of a block as bytes; None if it is not held."""
-        lane = block // self._blocks_per_lane
+    def _read_block(self, block: int, first: int, out: npt.NDArray[np.uint8]) -> None:
+        """Frames of a block as bytes, from one of them on; zeros if the block is not held."""
+        lane, content = block // self._blocks_per_lane, self._blocks[block]
         if self._open[lane] == block:
-            still_open: npt.NDArray[np.uint8] = self._open_frames[lane]
-            return still_open
-        content = self._blocks[block]
+            out[:] = self._open_frames[lane, first : first + len(out)]
+            return
         if content is None:
-            return None
+            out[:] = 0
+            return
         if not hasattr(self._of_thread, "decompressor"):
             self._of_thread.decompressor = zstandard.ZstdDecompressor()
-        raw = np.frombuffer(self._of_thread.decompressor.decompress(content), np.uint8)
-        frames: npt.NDArray[np.uint8] = raw.reshape(-1, self._frame_bytes)[:count].copy()
-        for index in range(1, count):
-            np.bitwise_xor(frames[index], frames[index - 1], out=frames[index])
-        return frames
+        changes = np.frombuffer(self._of_thread.decompressor.decompress(content), np.uint8)
+        changes = changes.reshape(-1, self._frame_bytes)
+        np.bitwise_xor.reduce(changes[: first + 1], axis=0, out=out[0])
+        for index in range(1, len(out)):
+            np.bitwise_xor(out[index - 1], changes[first + index], out=out[index])
 
 
 @functools.cache
