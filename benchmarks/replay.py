@@ -18,6 +18,7 @@ from benchmarks.measure import environment, times_ms
 from benchmarks.peers import StackReplay
 from switchmt_snn import config_io
 from switchmt_snn.config import resolve
+from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.machine import keep_freed_memory
@@ -161,7 +162,10 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     keep_freed_memory()  # as `train` does
-    result = measure(options.run, options.steps, options.repeats)
+    try:
+        result = measure(options.run, options.steps, options.repeats)
+    except SwitchMTError as error:  # such as a run that is not there
+        parser.exit(error.exit_code, f"{error}\n")
     if options.json:
         print(json.dumps(result, indent=1))
         return
