@@ -108,7 +108,7 @@ def update_part(update: dict[str, Any]) -> list[str]:
         "one pass over memory, which also rounds the weights for the next update. For autograd all layers are one",
         "operation. On a processor with AMX, which was not measured, products in bfloat16 are PyTorch's.",
         "",
-        "The native parts are built once per machine, in some 5 s; compiling takes 20 to 35 s at every start. So",
+        "The native parts are built once per machine, in some 7 s; compiling takes 20 to 35 s at every start. So",
         "`auto` is native on the 84x84 network, where the processor has AVX-512 or updates are in bfloat16, and",
         "compiles other runs of 150,000 updates or more. Scores with bfloat16:",
         "[results/minatar](../results/minatar/README.md).",

@@ -211,7 +211,7 @@ class LearningConfig:
     """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
     has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
     engine: Literal["auto"] | Engine = "auto"
-    """Updates operation by operation (eager), in C++ (native: CPU; built once, some 5 s), compiled by torch.compile (20
+    """Updates operation by operation (eager), in C++ (native: CPU; built once, some 7 s), compiled by torch.compile (20
     to 35 s per start), or compiled into a CUDA graph; each rounds in its own way. auto, on a CPU with a C++ compiler:
     native for the nature trunk (AVX-512 or bfloat16), compiled from 150,000 updates on; else eager."""
     clip_rewards: bool = True
