@@ -19,11 +19,10 @@ import torch
 
 from benchmarks.measure import environment, interleaved_ms, matmul_gflops, network_macs, read_gigabytes_per_s, summary
 from benchmarks.peers import PlainLoop
-from switchmt_snn import config_io
-from switchmt_snn.config import resolve
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.config import load_config, resolve
 from switchmt_snn.export import to_onnx
-from switchmt_snn.export.engines import OnnxAgent
-from switchmt_snn.learning.agent import Agent
+from switchmt_snn.export.runtimes.agents import OnnxAgent
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network, trainable_parameters
 from switchmt_snn.tasks.make import make_suite
@@ -34,7 +33,7 @@ PLAIN = "plain loop over snn.Leaky"
 
 def engines() -> tuple[dict[str, Callable[[Any], object]], Agent]:
     """Observations ``[B, 4, 84, 84]`` to Q-values, by name, the first being the one that ratios refer to; our agent."""
-    config = resolve(config_io.load_config("quickstart"))
+    config = resolve(load_config("quickstart"))
     suite = make_suite(config.tasks)
     agent = Agent(build_network(config.network, observation_spec(suite), 1), suite, config, torch.device("cpu"), 0)
     exported = OnnxAgent(to_onnx(agent).SerializeToString(), suite, config, threads=torch.get_num_threads())

@@ -23,12 +23,11 @@ from benchmarks.environments import wrapped_game
 from benchmarks.measure import environment, rates
 from benchmarks.peers import ACTIONS, PlainLoop
 from benchmarks.update_step import PeerUpdate
-from switchmt_snn import config_io
-from switchmt_snn.config import resolve
+from switchmt_snn.config import load_config, resolve
 from switchmt_snn.learning.events import Stepped
-from switchmt_snn.learning.machine import keep_freed_memory
-from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.training import Training
+from switchmt_snn.machine.devices import keep_freed_memory
+from switchmt_snn.replay.ring import Batch
 from switchmt_snn.tasks.make import make_suite
 
 GAME = "breakout"
@@ -77,7 +76,7 @@ def plain_loop(steps: int) -> Iterator[None]:
 
 def our_loop(steps: int, **learning: Any) -> Iterator[None]:
     """The training loop itself; yields after every agent step."""
-    base = config_io.load_config("quickstart")
+    base = load_config("quickstart")
     config = resolve(
         replace(
             base,

@@ -19,8 +19,7 @@ import numpy as np
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from benchmarks.measure import environment, rates
-from switchmt_snn import config_io
-from switchmt_snn.config import resolve
+from switchmt_snn.config import load_config, resolve
 from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.suite import TaskSuite
@@ -56,7 +55,7 @@ def our_steps(play: Play, rng: np.random.Generator, steps: int) -> None:
 
 def measure(steps: int) -> dict[str, Any]:
     """Every game of the quickstart."""
-    suite: TaskSuite = make_suite(resolve(config_io.load_config("quickstart")).tasks)
+    suite: TaskSuite = make_suite(resolve(load_config("quickstart")).tasks)
     games = {}
     for task, name in enumerate(suite.names):
         env, rng = wrapped_game(name), np.random.default_rng(0)

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from switchmt_snn.learning.run_folder import processor
-from switchmt_snn.spiking.native_products import Panels
+from switchmt_snn.native.products import Panels
+from switchmt_snn.runs.folder import processor
 
 PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "ale-py", "zstandard", "onnxruntime")
 

@@ -16,15 +16,14 @@ import torch
 
 from benchmarks.measure import environment, times_ms
 from benchmarks.peers import StackReplay
-from switchmt_snn import config_io
-from switchmt_snn.config import resolve
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.config import load_config, resolve
 from switchmt_snn.errors import SwitchMTError
-from switchmt_snn.learning.agent import Agent
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.machine import keep_freed_memory
-from switchmt_snn.learning.replay import FrameReplay
-from switchmt_snn.learning.run import load_agent
 from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.machine.devices import keep_freed_memory
+from switchmt_snn.replay.ring import FrameReplay
+from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play, episode_seed
@@ -104,7 +103,7 @@ def fill_stacks(replay: StackReplay, events: list[tuple[Any, ...]], shape: tuple
 def measure(run: str | None, steps: int, repeats: int) -> dict[str, Any]:
     """Every game of the run, or of the quickstart."""
     agent = load_agent(run, device="cpu") if run is not None else None
-    config = agent.config if agent is not None else resolve(config_io.load_config("quickstart"))
+    config = agent.config if agent is not None else resolve(load_config("quickstart"))
     suite = agent.suite if agent is not None else make_suite(config.tasks)
     network = build_network(config.network, observation_spec(suite), 1)
     learner = Learner(network, config.learning, suite.valid_actions_KA, torch.device("cpu"), 1)

@@ -16,11 +16,10 @@ import numpy as np
 import torch
 
 from benchmarks.measure import environment, interleaved_ms, summary
-from switchmt_snn import config_io
-from switchmt_snn.config import resolve
+from switchmt_snn.config import load_config, resolve
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.machine import keep_freed_memory
-from switchmt_snn.learning.replay import Batch, FrameReplay
+from switchmt_snn.machine.devices import keep_freed_memory
+from switchmt_snn.replay.ring import Batch, FrameReplay
 from switchmt_snn.spiking.network import ObservationSpec, build_network, trainable_parameters
 from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play
@@ -33,7 +32,7 @@ REPLAY_SIZES = (10_000, 30_000, 100_000, 300_000)
 
 def learner_of(timesteps: int, batch_size: int, tasks: int) -> tuple[Learner, Batch]:
     """A learner of that size, and a random batch of its last task."""
-    config = config_io.load_config("quickstart")
+    config = load_config("quickstart")
     network = replace(config.network, method="SwitchMT", timesteps=timesteps, dendritic_segments=tasks)
     config = resolve(replace(config, network=network, learning=replace(config.learning, engine="eager")))
     observation = ObservationSpec((4, 84, 84), 4, 1 / 255, True, ACTIONS, tasks)
@@ -62,7 +61,7 @@ def updates(repeats: int) -> dict[str, Any]:
 
 def samples(repeats: int) -> dict[str, Any]:
     """Sampling 32 and 512 of compressed replays filled with real play of Breakout (repeated), and their bytes."""
-    suite = make_suite(resolve(config_io.load_config("quickstart")).tasks)
+    suite = make_suite(resolve(load_config("quickstart")).tasks)
     play, rng = Play(suite, suite.index("breakout"), 1), np.random.default_rng(0)
     episodes = []
     for seed in range(20):

@@ -39,14 +39,13 @@ from benchmarks.measure import (
     summary,
 )
 from benchmarks.peers import ACTIONS, PlainLoop, spikingjelly_network
-from switchmt_snn import config_io
-from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.config import ExperimentConfig, load_config, resolve
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.machine import keep_freed_memory
-from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.training import observation_spec
-from switchmt_snn.spiking import native_library
-from switchmt_snn.spiking.native_products import spikes_as_bits
+from switchmt_snn.machine.devices import keep_freed_memory
+from switchmt_snn.native import library as native_library
+from switchmt_snn.native.products import spikes_as_bits
+from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
@@ -117,7 +116,7 @@ class Work(NamedTuple):
 
 def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Callable[[], None]], dict[str, float]]:
     """Every step by name, the first being the one that ratios refer to; and their limits in milliseconds."""
-    base = config_io.load_config("quickstart")
+    base = load_config("quickstart")
     suite = make_suite(base.tasks)
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (2, batch_size, *suite.observation_shape), np.uint8)

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from docs.performance_page import performance_page
-from switchmt_snn import config_io
-from switchmt_snn.export.report import microjoule
+from switchmt_snn.config import field_documentation, load_config
+from switchmt_snn.export.report.page import microjoule
 
 ROOT = Path(__file__).parent.parent
 STUDENT_T_975 = {2: 4.303, 4: 2.776, 6: 2.447, 8: 2.306}
@@ -40,7 +40,7 @@ def configuration_page() -> str:
         "`minatar` (three small games that learn on a CPU), `fast` (for a GPU; not run on one yet).",
         "`docs/algorithm.md` says where the presets come from.",
     ]
-    for prefix, text, rows in config_io.field_documentation():
+    for prefix, text, rows in field_documentation():
         lines += [
             "",
             f"## {prefix or 'top level'}",
@@ -166,7 +166,7 @@ def minatar_page() -> str:
     runs = sorted(folder.glob("switchmt-seed*"))
     environment = json.loads((runs[0] / "environment.json").read_text())
     facts = {run.name: json.loads((run / "environment.json").read_text()) for run in sorted(folder.glob("*-seed*"))}
-    config = config_io.load_config(runs[0] / "config.yaml")
+    config = load_config(runs[0] / "config.yaml")
     games, total = config.tasks.names, config.total_steps
     protocol = json.loads(max(runs[0].glob("evaluations/*.json")).read_text())["protocol"]
     lines = [
@@ -239,7 +239,7 @@ def export_page() -> str:
     ]
     for run in runs:
         parity = json.loads((run / "parity.json").read_text())
-        config = config_io.load_config(run / "config.yaml")
+        config = load_config(run / "config.yaml")
         exact, simulators = parity["dyadic"], parity["simulators"]
         bitwise = sum(row["bitwise"] for row in exact)
         names = ", ".join(dict.fromkeys(row["simulator"] for row in simulators))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.replay import LAYOUTS
-from switchmt_snn import config_io
+from switchmt_snn.config import load_config
 
 ROOT = Path(__file__).parent.parent
 
@@ -234,7 +234,7 @@ def replay_part(replays: list[dict[str, Any]]) -> list[str]:
         "",
         f"`python -m benchmarks.replay --steps {replays[0]['steps_per_game']} [--run RUN]`. Frames are kept once, in "
         "blocks of 16,",
-        "each XOR the one before it, then Zstandard (`switchmt_snn/learning/frames.py`); the samples are bitwise those",
+        "each XOR the one before it, then Zstandard (`switchmt_snn/replay/frames.py`); the samples are bitwise those",
         "of the plain ring. Bytes count everything: frames, actions, rewards, flags, Python's objects, open blocks.",
         "Where adding to a plain layout takes more than some 3 µs, the system was still handing out fresh pages.",
         "",
@@ -280,7 +280,7 @@ def sampling_part(replays: list[dict[str, Any]], *updates: dict[str, Any]) -> li
 
 def fast_part(environments: dict[str, Any], replay: dict[str, Any]) -> list[str]:
     """The arithmetic of configs/fast.yaml."""
-    config = config_io.load_config("fast")
+    config = load_config("fast")
     steps, copies, batch = config.total_steps, config.tasks.num_envs, config.learning.batch_size
     rounds, updates = steps // copies, steps // config.learning.update_every_steps
     budget_ms = 1800e3 / rounds

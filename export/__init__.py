@@ -5,9 +5,9 @@ written with the trained network, and ``run`` does all of it for a run folder. `
 while it plays, prices it, and writes a report.
 """
 
-from switchmt_snn.export.api import check_parity, to_nir, to_onnx
-from switchmt_snn.export.profiling import Profile, compare_profiles, profile, profile_file
-from switchmt_snn.export.run import ExportResult, ExportSettings, evaluate_engine, export, load_exported
+from switchmt_snn.export.export_run import ExportResult, ExportSettings, evaluate_engine, export, load_exported
+from switchmt_snn.export.objects import check_parity, to_nir, to_onnx
+from switchmt_snn.export.profile_run import Profile, compare_profiles, profile, profile_file
 
 __all__ = [
     "ExportResult",

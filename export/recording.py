@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
-from switchmt_snn.learning.agent import Agent
-from switchmt_snn.learning.cores import all_cores
+from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 

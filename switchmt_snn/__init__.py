@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from switchmt_snn.config import ExperimentConfig
-    from switchmt_snn.config_io import load_config
-    from switchmt_snn.learning.run import evaluate, load_agent, train
+    from switchmt_snn.config.yaml_io import load_config
+    from switchmt_snn.runs.run import evaluate, load_agent, train
 
 __version__ = "0.1.0"
 __all__ = ["ExperimentConfig", "__version__", "evaluate", "load_agent", "load_config", "train"]
 
 _HOMES = {
     "ExperimentConfig": "switchmt_snn.config",
-    "load_config": "switchmt_snn.config_io",
-    "evaluate": "switchmt_snn.learning.run",
-    "load_agent": "switchmt_snn.learning.run",
-    "train": "switchmt_snn.learning.run",
+    "load_config": "switchmt_snn.config.yaml_io",
+    "evaluate": "switchmt_snn.runs.run",
+    "load_agent": "switchmt_snn.runs.run",
+    "train": "switchmt_snn.runs.run",
 }
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from switchmt_snn.config import ExperimentConfig, resolve
-from switchmt_snn.config_io import from_dict
+from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite, VectorStep
 
 

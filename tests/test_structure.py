@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -14,20 +11,26 @@ ROOT = Path(__file__).parent.parent
 FLOORS = {
     "errors": 0,
     "config": 1,
-    "config_io": 2,
-    "spiking": 3,
-    "tasks": 3,
-    "learning": 4,
-    "export": 5,
-    "viewing": 5,
-    "cli": 6,
-    "__main__": 7,
-    "__init__": 7,
+    "machine": 2,
+    "spiking": 2,
+    "tasks": 2,
+    "replay": 3,
+    "native": 3,
+    "updates": 4,
+    "learning": 5,
+    "acting": 5,
+    "runs": 6,
+    "export": 7,
+    "viewing": 7,
+    "cli": 8,
+    "__main__": 9,
+    "__init__": 9,
 }
 
 
 def sources() -> list[Path]:
-    return [*sorted((ROOT / "switchmt_snn").rglob("*.py")), *sorted((ROOT / "export").rglob("*.py"))]
+    inside = [path for path in (ROOT / "switchmt_snn").rglob("*.py") if not path.is_symlink()]
+    return [*sorted(inside), *sorted((ROOT / "export").rglob("*.py"))]
 
 
 def room(path: Path) -> str:
@@ -94,34 +97,3 @@ def test_public_functions_have_docstrings() -> None:
     for path in sources():
         for node in public(ast.parse(path.read_text()).body):
             assert ast.get_docstring(node), f"{path.name}: {node.name}"
-
-
-def test_wheel_carries_everything_and_no_top_level_export(tmp_path: Path) -> None:
-    subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)],
-        check=True,
-        capture_output=True,
-    )
-    (wheel,) = tmp_path.glob("*.whl")
-    names = zipfile.ZipFile(wheel).namelist()
-    assert "switchmt_snn/export/__init__.py" in names
-    assert "switchmt_snn/configs/quickstart.yaml" in names
-    assert "switchmt_snn/py.typed" in names
-    tops = {name.split("/")[0] for name in names}
-    assert tops == {"switchmt_snn", next(top for top in tops if top.endswith(".dist-info"))}
-    target = tmp_path / "site"
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(target)
-    code = (
-        "import switchmt_snn.export, switchmt_snn.config_io as c, sys; c.load_config('paper');"
-        "assert switchmt_snn.export.__file__.startswith(sys.argv[1]), switchmt_snn.export.__file__"
-    )
-    subprocess.run([sys.executable, "-c", code, str(target)], check=True, cwd=target)
-
-
-def test_this_install_finds_export_and_configs() -> None:
-    import switchmt_snn.export
-    from switchmt_snn.config_io import load_config
-
-    assert switchmt_snn.export.__doc__
-    assert load_config("quickstart").name == "quickstart"

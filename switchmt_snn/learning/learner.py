@@ -15,14 +15,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from switchmt_snn.config import LearningConfig
-from switchmt_snn.learning.device_frames import to_device
-from switchmt_snn.learning.engine import NativeEvaluate, make_evaluate
-from switchmt_snn.learning.graph import DeviceBatch, GraphedStep, Step
-from switchmt_snn.learning.native_adam import NativeAdam
-from switchmt_snn.learning.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
-from switchmt_snn.learning.replay import Batch
 from switchmt_snn.learning.state import Stateful
+from switchmt_snn.native.adam import NativeAdam
+from switchmt_snn.replay.on_device import to_device
+from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.updates.cuda_graph import DeviceBatch, GraphedStep, Step
+from switchmt_snn.updates.engine import NativeEvaluate, make_evaluate
+from switchmt_snn.updates.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
 
 
 def td_target(

@@ -19,14 +19,15 @@ from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, LayerHealth, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.memory import GIB, compresses_replay
-from switchmt_snn.learning.processes import ProcessGroup
-from switchmt_snn.learning.replay import FrameReplay
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
+from switchmt_snn.machine.memory import GIB
+from switchmt_snn.replay.ring import FrameReplay
+from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite, VectorStep
+from switchmt_snn.updates.processes import ProcessGroup
 
 HEALTH_BATCH = 32
 

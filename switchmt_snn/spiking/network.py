@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.dendrites import ActiveDendrites, keep_k_winners
-from switchmt_snn.spiking.encoding import Encoder
+from switchmt_snn.spiking.encodings import Encoder
 from switchmt_snn.spiking.neurons import ReLULayer, SpikingLayer, make_neuron_layer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 

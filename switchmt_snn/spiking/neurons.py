@@ -97,8 +97,8 @@ class SpikingLayer(nn.Module):
     """IF or LIF neurons (``snntorch.Leaky``) over T steps with explicit state.
 
     ``engine="snntorch"`` calls ``snntorch.Leaky`` step by step; ``"fused"`` does the same float32 arithmetic in one
-    autograd function (bitwise equal forward, gradients equal to rounding; tests/test_neurons.py). Learnable beta or
-    threshold, and the stochastic surrogate SSO, always run through ``snntorch.Leaky``.
+    autograd function (bitwise equal forward, gradients equal to rounding: tests/spiking/test_neurons.py). Learnable
+    beta or threshold, and the stochastic surrogate SSO, always run through ``snntorch.Leaky``.
 
     Attributes:
         leaky: the snnTorch neuron; holds beta, threshold, reset mechanism and surrogate. Its own ``mem`` is never used.

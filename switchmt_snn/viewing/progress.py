@@ -11,9 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
-from switchmt_snn.learning.run_folder import RunFolder
 from switchmt_snn.learning.switching import SwitchTo
 from switchmt_snn.learning.training import Training
+from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.viewing.health import health_warnings
 
 RETURN_WINDOW_EPISODES = 20
@@ -22,7 +22,7 @@ LIVE_EVERY_S = 0.5
 
 
 class Progress:
-    """An observer that shows where a run stands; see :class:`switchmt_snn.learning.run.Observer`."""
+    """An observer that shows where a run stands; see :class:`switchmt_snn.runs.run.Observer`."""
 
     def __init__(self, console: Console) -> None:
         self.console = console

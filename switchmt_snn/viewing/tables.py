@@ -7,9 +7,9 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from switchmt_snn.learning.description import MethodDescription
-from switchmt_snn.learning.evaluation import Evaluation, TaskScore
-from switchmt_snn.learning.memory import GIB
+from switchmt_snn.acting.evaluation import Evaluation, TaskScore
+from switchmt_snn.machine.memory import GIB
+from switchmt_snn.runs.description import MethodDescription
 from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PAPER_SCORES
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from switchmt_snn.errors import MissingExtraError
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured
-from switchmt_snn.learning.run_folder import RunFolder
 from switchmt_snn.learning.training import Training
+from switchmt_snn.runs.folder import RunFolder
 
 
 class TensorBoard:

@@ -1,0 +1,1 @@
+"""Chips: their limits, and which of them hold a network."""

@@ -1,0 +1,1 @@
+"""Spikes and synaptic operations, counted exactly."""

@@ -1,0 +1,313 @@
+"""What a NIR file does on given inputs: spikes and operations by layer, counted in the reference interpreter.
+
+An ``.npz`` file holds the inputs: raw ``observations`` for a graph with this package's metadata, which says how to
+encode them, or encoded ``inputs`` for anybody's graph. A layer is a node with weights and the spiking node that it
+feeds; what is counted, and how often, is as in :mod:`export.profile`.
+
+Shapes: T simulation steps, N decisions, B batch, ... a node's own shape.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import nir
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from switchmt_snn.config import NetworkConfig
+from switchmt_snn.errors import ExportError
+from switchmt_snn.export.counts.network import LayerProfile, TaskProfile, layer_profile
+from switchmt_snn.export.counts.synapses import NeuronCounter, SynapseCounter, Synapses
+from switchmt_snn.export.folding import SPIKE_ENCODINGS
+from switchmt_snn.export.parity.activity import chunks
+from switchmt_snn.export.runtimes.agents import read_nir
+from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
+from switchmt_snn.spiking.encodings import Encoder
+
+_SYNAPTIC = (nir.Conv2d, nir.Affine, nir.Linear)
+_SPIKING = (nir.IF, nir.LIF, nir.Threshold)
+_FACTS = ("encoding", "timesteps", "observation_shape", "frame_stack", "scale")
+"""Metadata that encoding raw observations needs."""
+
+Array = npt.NDArray[Any]
+
+
+def profile_nir(path: Path, observations: Path) -> TaskProfile:
+    """Count what a NIR file does; the time is that of the interpreter, the memory that of the ``.npz``.
+
+    Args:
+        path: a NIR file; one Input, one Output, nodes that :class:`NirInterpreter` knows, one source per node with
+            weights, weights before every spiking node.
+        observations: an ``.npz`` with either ``observations``, raw ``[N, *shape]`` (the graph must have this package's
+            metadata), or ``inputs``, encoded ``[T, N, *shape of the Input node]``; and, before the ``dt`` of the
+            graph's metadata, ``dt``, the length of a simulation step.
+
+    Returns:
+        One layer per node with weights, in forward order. The task's name is the metadata's, or the file's.
+
+    Raises:
+        ExportError: one of the files cannot be read, or they do not fit each other.
+    """
+    graph, stored = _graph(path), _arrays(observations)
+    own = all(key in graph.metadata for key in _FACTS)
+    interpreter = NirInterpreter(graph, _dt(graph, stored), reset=str(graph.metadata.get("reset", "zero")))
+    shape = _sides(graph.nodes[interpreter.input].input_type["input"])
+    if "inputs" in stored:
+        inputs = _encoded(stored["inputs"], shape, graph.metadata if own else {})
+    elif own:
+        inputs = _raw(stored["observations"], graph.metadata)
+    else:
+        raise ExportError(
+            f"{path} does not say how to encode observations, expected the metadata {', '.join(_FACTS)} that "
+            f"switchmt-snn writes; store encoded inputs of shape {_shape(('T', 'N', *shape))} as 'inputs' instead"
+        )
+    layers = _layers(interpreter, inputs)
+    record = {name for layer in layers for name in (layer.source, layer.spiking) if name is not None}
+    record.discard(interpreter.input)
+    for batch_TB in inputs.batches:
+        _, recorded = interpreter.run(batch_TB, sorted(record))
+        recorded[interpreter.input] = batch_TB[:1] if inputs.once else batch_TB
+        for layer in layers:
+            layer.add(recorded)
+    task = str(graph.metadata.get("task", path.stem))
+    return TaskProfile(task, inputs.decisions, inputs.timesteps, True, tuple(layer.profile() for layer in layers))
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """What the Input node gets.
+
+    Attributes:
+        spikes: whether they are spikes, all of them.
+        once: whether they are the same at every step, so that the first layer's synapses work once per decision.
+        batches: encoded inputs ``[T, B, ...]``.
+    """
+
+    decisions: int
+    timesteps: int
+    spikes: bool
+    once: bool
+    batches: Iterator[Float]
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """A node with weights while it is being counted.
+
+    Attributes:
+        source: the node whose output is its input, flat or not.
+        spiking: the node that it feeds, with its ``neurons``; None for a head.
+    """
+
+    synapses: SynapseCounter
+    source: str
+    outputs: int
+    spiking: str | None
+    neurons: NeuronCounter | None
+
+    def add(self, recorded: dict[str, Float]) -> None:
+        """Count a batch: outputs ``[T, B, ...]`` by node."""
+        self.synapses.add(recorded[self.source] != 0)
+        if self.spiking is not None and self.neurons is not None:
+            self.neurons.add(recorded[self.spiking] != 0)
+
+    def profile(self) -> LayerProfile:
+        """What has been counted."""
+        updates = self.neurons.spikes_TN.size if self.neurons is not None else 0
+        return layer_profile(self.synapses, self.neurons, self.outputs, updates)
+
+
+def _layers(interpreter: NirInterpreter, inputs: _Inputs) -> list[_Layer]:
+    """The graph's nodes with weights and what each of them feeds, in forward order."""
+    nodes = interpreter.graph.nodes
+    fed: dict[str, str] = {}
+    for name in interpreter.order:
+        if isinstance(nodes[name], _SPIKING):
+            weights = _feeding(interpreter, name)
+            if weights in fed:
+                raise ExportError(
+                    f"the NIR node {weights} feeds the spiking nodes {fed[weights]} and {name}, expected one; "
+                    "give each of them weights of its own"
+                )
+            fed[weights] = name
+    if not fed:
+        raise ExportError("the NIR graph has no spiking node, expected IF, LIF or Threshold; nothing can be counted")
+    layers = []
+    for name in interpreter.order:
+        if isinstance(nodes[name], _SYNAPTIC):
+            synapses, source = _synapses(interpreter, name, inputs)
+            outputs = _outputs(interpreter, name)
+            neurons = NeuronCounter(fed[name], outputs, inputs.timesteps) if name in fed else None
+            layers.append(_Layer(SynapseCounter(synapses), source, int(np.prod(outputs)), fed.get(name), neurons))
+    return layers
+
+
+def _feeding(interpreter: NirInterpreter, spiking: str) -> str:
+    """The node with weights whose output drives a spiking node: the first in forward order, if there are several."""
+    found: set[str] = set()
+    seen, to_do = {spiking}, [spiking]
+    while to_do:
+        for source in interpreter.sources[to_do.pop()]:
+            node = interpreter.graph.nodes[source]
+            if isinstance(node, _SYNAPTIC):
+                found.add(source)
+            elif source not in seen and not isinstance(node, _SPIKING):
+                seen.add(source)
+                to_do.append(source)
+    if not found:
+        raise ExportError(f"no weights lead to the NIR node {spiking}, expected a Conv2d, Affine or Linear before it")
+    return min(found, key=interpreter.order.index)
+
+
+def _synapses(interpreter: NirInterpreter, name: str, inputs: _Inputs) -> tuple[Synapses, str]:
+    """A node's synapses, and the node that it hears through Flatten."""
+    nodes, source = interpreter.graph.nodes, name
+    while source == name or isinstance(nodes[source], nir.Flatten):
+        sources = interpreter.sources[source]
+        if len(sources) != 1:
+            raise ExportError(f"the NIR node {source} adds up {', '.join(sources)}, expected one source before weights")
+        (source,) = sources
+    spikes_in = inputs.spikes if source == interpreter.input else isinstance(nodes[source], _SPIKING)
+    shape = _sides(nodes[name].input_type["input"])
+    stride, padding = interpreter.geometry.get(name, ((1, 1), (0, 0)))
+    return Synapses(name, nodes[name].weight, shape, spikes_in, stride=stride, padding=padding), source
+
+
+def _outputs(interpreter: NirInterpreter, name: str) -> tuple[int, ...]:
+    """Shape of what a node with weights computes at a step."""
+    node = interpreter.graph.nodes[name]
+    stated = _sides(node.output_type["output"])
+    if name not in interpreter.geometry:
+        return stated
+    image, kernel = _sides(node.input_type["input"])[1:], node.weight.shape[2:]
+    computed = (
+        len(node.weight),
+        *(
+            (side + 2 * pad - reach) // step + 1
+            for side, reach, step, pad in zip(image, kernel, *interpreter.geometry[name], strict=True)
+        ),
+    )
+    if computed != stated or min(computed) < 1:  # nir 1.0.8 takes every kernel for a square
+        raise ExportError(
+            f"the NIR node {name} has output shape {list(stated)}, expected {list(computed)} of a kernel of "
+            f"{kernel[0]} x {kernel[1]} on {image[0]} x {image[1]}; NIR files need square kernels that fit the image"
+        )
+    return computed
+
+
+def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
+    """Raw observations ``[N, *shape]``, encoded as the network was trained; chunk by chunk, seeds 0, 1, 2, ..."""
+    expected = _sides(facts["observation_shape"])
+    if observations.shape[1:] != expected or len(observations) == 0:
+        raise ExportError(
+            f"observations has shape {_shape(observations.shape)}, expected {_shape(('N', *expected))} with N >= 1; "
+            "record them with the network of this file"
+        )
+    if float(facts["scale"]) < 1 and observations.dtype.kind == "f":
+        raise ExportError(
+            f"observations holds {observations.dtype} values, expected raw integers (the graph scales them by "
+            f"{float(facts['scale']):.4g}); store them as they were seen"
+        )
+    encoding, timesteps, scale = str(facts["encoding"]), int(facts["timesteps"]), float(facts["scale"])
+    if encoding == "events" and "event_threshold" not in facts:
+        raise ExportError("the NIR graph's metadata has no event_threshold, expected it for events; export again")
+    threshold = float(facts.get("event_threshold", NetworkConfig.event_threshold))
+    settings = NetworkConfig(encoding=cast(Any, encoding), timesteps=timesteps, event_threshold=threshold)
+    # Whether the values suit the encoding was checked when the network was built.
+    encoder = Encoder(settings, int(facts["frame_stack"]), inputs_in_unit_range=True)
+
+    def batches() -> Iterator[Float]:
+        for seed, chunk in enumerate(chunks(observations)):
+            scaled = torch.from_numpy(chunk).to(torch.float32) * scale
+            encoded: Float = encoder(scaled, torch.Generator().manual_seed(seed)).numpy()
+            yield np.broadcast_to(encoded, (timesteps, *encoded.shape[1:]))
+
+    return _Inputs(len(observations), timesteps, encoding in SPIKE_ENCODINGS, encoding == "direct", batches())
+
+
+def _encoded(inputs: Array, shape: tuple[int, ...], facts: dict[str, Any]) -> _Inputs:
+    """Inputs ``[T, N, *shape]`` as they are; ``facts`` is empty for a graph of somebody else."""
+    steps = int(facts["timesteps"]) if facts else inputs.shape[0] if inputs.ndim else 0
+    if inputs.ndim != 2 + len(shape) or inputs.shape[2:] != shape or 0 in inputs.shape or len(inputs) != steps:
+        expected = _shape((steps if facts else "T", "N", *shape))
+        raise ExportError(
+            f"inputs has shape {_shape(inputs.shape)}, expected {expected} with T and N >= 1: the graph's Input at "
+            "every simulation step"
+        )
+    encoding = facts.get("encoding")
+    spikes = bool(((inputs == 0) | (inputs == 1)).all()) and encoding in (None, *SPIKE_ENCODINGS)
+    once = encoding == "direct" and bool((inputs == inputs[:1]).all())
+    batches = (inputs[:, part].astype(np.float32) for part in chunks(np.arange(inputs.shape[1])))
+    return _Inputs(inputs.shape[1], len(inputs), spikes, once, batches)
+
+
+def _graph(path: Path) -> nir.NIRGraph:
+    """A graph from a file, with numbers in it only."""
+    graph = read_nir(path)
+    for name, node in graph.nodes.items():
+        for parameter, values in vars(node).items():
+            if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise ExportError(f"{path}: {parameter} of {name} holds {_not_finite(values)}, expected finite numbers")
+    return graph
+
+
+def _arrays(path: Path) -> dict[str, Array]:
+    """``observations`` or ``inputs``, and ``dt`` if it is there, from an ``.npz``."""
+    stored: dict[str, Array] = {}
+    try:
+        with path.open("rb") as stream:  # NumPy forgets to close an archive that is damaged
+            file = np.load(stream, allow_pickle=False)
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise ValueError("it is a single array")
+            keys = list(file.files)
+            stored.update((key, np.asarray(file[key])) for key in ("observations", "inputs", "dt") if key in keys)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ExportError(
+            f"{path} cannot be read ({reason:.120}), expected an .npz file with 'observations' or 'inputs'"
+        ) from error
+    if ("observations" in stored) == ("inputs" in stored):
+        raise ExportError(
+            f"{path} holds {', '.join(keys) or 'nothing'}, expected either 'observations' (raw, [N, ...]) or 'inputs' "
+            "(encoded, [T, N, ...])"
+        )
+    for key, values in stored.items():
+        if values.dtype.kind not in "buif":
+            raise ExportError(f"{path}: {key} has values of type {values.dtype}, expected numbers")
+        if not np.isfinite(values).all():
+            raise ExportError(f"{path}: {key} holds {_not_finite(values)}, expected finite numbers")
+    return stored
+
+
+def _dt(graph: nir.NIRGraph, stored: dict[str, Array]) -> float:
+    """Length of a simulation step: the ``.npz``'s, else the graph's."""
+    dt = stored.get("dt", graph.metadata.get("dt"))
+    if dt is None:
+        raise ExportError(
+            "neither the NIR graph's metadata nor the .npz file has dt, expected the length of a simulation step; "
+            "store it beside the inputs as 'dt'"
+        )
+    if np.size(dt) != 1 or not np.all(np.asarray(dt) > 0):
+        raise ExportError(f"dt is {np.asarray(dt).tolist()}, expected one number above 0")
+    return float(np.ravel(dt)[0])
+
+
+def _not_finite(values: Array) -> str:
+    """The first value that is no number, and where it is."""
+    where = tuple(int(index[0]) for index in np.nonzero(~np.isfinite(values)))
+    return f"{values[where]} at {list(where)}"
+
+
+def _sides(shape: npt.ArrayLike) -> tuple[int, ...]:
+    return tuple(int(side) for side in np.asarray(shape))
+
+
+def _shape(sides: tuple[Any, ...]) -> str:
+    return f"[{', '.join(map(str, sides))}]"

@@ -1,0 +1,137 @@
+"""Export from Python: a run folder, an agent, or a network of one's own becomes ONNX and NIR objects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import nir
+import numpy as np
+import numpy.typing as npt
+import onnx
+import torch
+
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.errors import ExportError
+from switchmt_snn.export.folding import FoldedNetwork, fold, quantized
+from switchmt_snn.export.formats.nir_writer import NirProfile, can_express, nir_graph
+from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
+from switchmt_snn.export.parity.compare import Exports
+from switchmt_snn.export.parity.proof import prove
+from switchmt_snn.export.recording import play
+from switchmt_snn.runs.run import load_agent
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite
+
+Source = str | Path | Agent | QNetwork
+"""A run folder, an agent, or a bare network (its tasks are then called ``task_0``, ...)."""
+
+
+def to_onnx(
+    source: Source, kind: Literal["decision", "step"] = "decision", task: str | None = None, int8: bool = False
+) -> onnx.ModelProto:
+    """A network as an ONNX model; ``onnx.save(to_onnx(run), path)`` writes it.
+
+    Args:
+        source: see :data:`Source`.
+        kind: the whole decision, or one simulation step (:mod:`switchmt_snn.export.formats.onnx_writer`).
+        task: fold this task in; None serves all tasks by an input.
+        int8: store weights as 8-bit integers.
+
+    Raises:
+        ExportError: an ANN has no step, or a weight is not finite.
+        TaskError: unknown task.
+    """
+    network = _folded(source, int8)
+    index = None if task is None else network.suite.index(task)
+    return decision_model(network, index) if kind == "decision" else step_model(network, index)
+
+
+def to_nir(source: Source, task: str, profile: NirProfile = "portable", int8: bool = False) -> nir.NIRGraph:
+    """One task of a network as a NIR graph; :func:`write_nir` writes it.
+
+    Args:
+        source: see :data:`Source`.
+        task: whose statistics and gains are folded in.
+        profile: see :mod:`switchmt_snn.export.formats.nir_writer`.
+        int8: weights rounded to 8 bits (stored as float32; NIR has no integers).
+
+    Raises:
+        ExportError: the profile cannot express the network exactly; the message names one that can.
+        TaskError: unknown task.
+    """
+    network = _folded(source, int8)
+    return nir_graph(network, network.suite.index(task), profile)
+
+
+def check_parity(
+    source: Source,
+    observations: dict[str, npt.NDArray[Any]] | None = None,
+    profile: NirProfile = "portable",
+    int8: bool = False,
+) -> dict[str, Any]:
+    """Export in memory, in every format that can express the network, and compare with it.
+
+    Args:
+        source: see :data:`Source`.
+        observations: raw observations ``[N, *shape]`` by task; None plays 1,000 decisions of each (not for a bare
+            network, which has no games).
+        profile: NIR profile.
+        int8: compare a network with rounded weights.
+
+    Returns:
+        What ``parity.json`` holds; ``failures`` is empty if everything agrees as it must.
+    """
+    agent = _agent(source)
+    network = fold(agent)
+    exported = quantized(network) if int8 else network
+    names = agent.suite.names
+    graphs = None
+    if can_express(network, profile):
+        graphs = {name: nir_graph(exported, k, profile) for k, name in enumerate(names)}
+    step = step_model(exported).SerializeToString() if network.spiking else None
+    written = Exports(exported, decision_model(exported).SerializeToString(), step, graphs)
+    if observations is None:
+        evaluation = agent.config.evaluation
+        observations = {
+            name: play(agent, name, 1000, evaluation.epsilon, evaluation.seed).observations for name in names
+        }
+    missing = [name for name in names if name not in observations]
+    if missing:
+        raise ExportError(f"observations of {', '.join(missing)} are missing, expected every task: {', '.join(names)}")
+    return prove(agent, written, [observations[name] for name in names])
+
+
+def _folded(source: Source, int8: bool) -> FoldedNetwork:
+    network = fold(_agent(source))
+    return quantized(network) if int8 else network
+
+
+def _agent(source: Source) -> Agent:
+    if isinstance(source, Agent):
+        return source
+    return _unnamed(source) if isinstance(source, QNetwork) else load_agent(source, device="cpu")
+
+
+def _unnamed(network: QNetwork) -> Agent:
+    """An agent around a bare network: numbered tasks and actions, and no games to play."""
+    seen = network.observation
+    channels, *rest = seen.shape
+
+    def make(task: int, num_envs: int) -> TaskEnvironment:
+        raise ExportError("a bare network has no games to record, expected observations; pass observations=")
+
+    suite = TaskSuite(
+        names=tuple(f"task_{k}" for k in range(seen.num_tasks)),
+        frame_shape=(channels // seen.frame_stack, *rest),
+        frame_dtype=np.uint8 if seen.in_unit_range else np.float32,
+        frame_stack=seen.frame_stack,
+        scale=seen.scale,
+        in_unit_range=seen.in_unit_range,
+        action_names=tuple(f"action_{a}" for a in range(seen.num_actions)),
+        valid_actions_KA=np.ones((seen.num_tasks, seen.num_actions), np.bool_),
+        references={},
+        make=make,
+    )
+    return Agent(network, suite, ExperimentConfig(network=network.config), torch.device("cpu"), 0)

@@ -1,0 +1,112 @@
+"""``report.html``: one self-contained page about one or several profiles; every number comes from ``profile.json``."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+
+Frames = Sequence[npt.NDArray[Any]]
+"""Frames of each task's stretch of play, ``[n, *frame_shape]``."""
+
+_LAYER_COLOURS = ("#1b6e8c", "#3f9c9c", "#8fbf6a", "#d9b44a", "#c8553d", "#7a4b8c", "#5b6770", "#b07aa1")
+"""A layer's colour in every chart."""
+_CHANNEL_COLOURS = np.array(
+    [(38, 70, 83), (42, 157, 143), (233, 196, 106), (231, 111, 81), (120, 80, 160), (90, 160, 220), (150, 150, 150)],
+    np.uint8,
+)
+_PAPER, _BAND, _SPIKE = 255, 238, 20
+
+
+def render_report(runs: list[dict[str, Any]], frames: Sequence[Frames], command: str) -> str:
+    """The page.
+
+    Args:
+        runs: contents of ``profile.json``, one per run.
+        frames: for each run, the frames of each task's stretch of play (empty without).
+        command: what made it.
+    """
+    environment = Environment(
+        loader=PackageLoader("switchmt_snn.export.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= FILTERS
+    environment.globals |= FILTERS | {"colours": _LAYER_COLOURS, "raster": _raster, "picture": _picture}
+    return environment.get_template("report.html.jinja").render(
+        runs=list(zip(runs, frames, strict=True)), command=command
+    )
+
+
+def whole(value: float) -> str:
+    """A count."""
+    return f"{value:,.0f}"
+
+
+def digits(value: float) -> str:
+    """Three significant digits, without an exponent from 0.001 on."""
+    if value == 0:
+        return "0"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.3g}" if abs(value) >= 1e-3 else f"{value:.1e}"
+
+
+def microjoule(value_pj: float) -> str:
+    """Picojoule as microjoule."""
+    return digits(value_pj / 1e6)
+
+
+def millijoule(value_pj: float) -> str:
+    """Picojoule as millijoule."""
+    return digits(value_pj / 1e9)
+
+
+def thousandth(value: float) -> str:
+    """A unit as the next larger one."""
+    return digits(value / 1e3)
+
+
+def percent(value: float) -> str:
+    """A share."""
+    return f"{value:.2%}" if value < 1 else "100%"
+
+
+def two(value: float) -> str:
+    """A ratio."""
+    return f"{value:.2f}"
+
+
+FILTERS = {filter.__name__: filter for filter in (whole, digits, microjoule, millijoule, thousandth, percent, two)}
+
+
+def _raster(layer: dict[str, Any], timesteps: int) -> str:
+    """A layer's spikes as an image: a row per neuron, a column per simulation step, decisions as bands."""
+    spikes = np.array([[mark == "1" for mark in row] for row in layer["spikes"]], np.bool_)
+    steps = spikes.shape[1]
+    paper = np.where(np.arange(steps) // timesteps % 2, _BAND, _PAPER).astype(np.uint8)
+    return _encoded(np.where(spikes, np.uint8(_SPIKE), paper))
+
+
+def _picture(frame: npt.NDArray[Any]) -> str:
+    """A grey frame ``[1, H, W]``, or one of binary channels ``[C, H, W]``, each in its colour."""
+    if len(frame) == 1:
+        return _encoded(frame[0])
+    shown = np.full((*frame.shape[1:], 3), _PAPER, np.uint8)
+    for channel, present in enumerate(frame):
+        shown[present > 0] = _CHANNEL_COLOURS[channel % len(_CHANNEL_COLOURS)]
+    return _encoded(shown)
+
+
+def _encoded(pixels: npt.NDArray[np.uint8]) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()

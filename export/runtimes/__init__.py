@@ -1,0 +1,1 @@
+"""What runs exported files: onnxruntime, the NIR interpreter, other projects' simulators."""

@@ -1,0 +1,202 @@
+"""Exported files as agents: onnxruntime and the NIR interpreter play and answer like the trained network."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import nir
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnxruntime
+import torch
+
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.acting.evaluation import DecisionMaker
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.errors import ExportError
+from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
+from switchmt_snn.spiking.encodings import Encoder
+from switchmt_snn.tasks.suite import TaskSuite
+
+Observations = npt.NDArray[Any]
+
+
+def onnx_session(model: Path | bytes, threads: int = 1) -> onnxruntime.InferenceSession:
+    """A session; on one thread sums have one order.
+
+    Raises:
+        ExportError: not an ONNX file, or one that refers to other files (external data).
+    """
+    with _readable(model, "an ONNX file"):
+        proto = onnx.load_from_string(model) if isinstance(model, bytes) else onnx.load(model, load_external_data=False)
+        external = [t.name for t in proto.graph.initializer if t.data_location == onnx.TensorProto.EXTERNAL]
+        if external:
+            raise ExportError(f"{model!s:.80} keeps weights in other files ({external[0]}), expected one whole file")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.log_severity_level = 3
+        return onnxruntime.InferenceSession(proto.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def read_nir(path: Path) -> nir.NIRGraph:
+    """A NIR graph from a file.
+
+    Raises:
+        ExportError: missing, or not a NIR file.
+    """
+    with _readable(path, "a NIR file"):
+        return nir.read(path)
+
+
+@contextmanager
+def _readable(source: Path | bytes, expected: str) -> Iterator[None]:
+    try:
+        yield
+    except ExportError:
+        raise
+    except Exception as error:  # onnx, onnxruntime, h5py and nir raise whatever their parsers meet
+        name = str(source) if isinstance(source, Path) else "a model in memory"
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ExportError(f"{name} cannot be read ({reason:.120}), expected {expected}; export again") from error
+
+
+def encode(suite: TaskSuite, config: ExperimentConfig, observations: Observations, seed_or_generator: Any) -> Float:
+    """Encoded inputs ``[T, B, ...]`` as the network sees them (random encodings draw from the generator)."""
+    generator = seed_or_generator
+    if isinstance(generator, int):
+        generator = torch.Generator().manual_seed(generator)
+    encoder = Encoder(config.network, suite.frame_stack, suite.in_unit_range)
+    scaled = torch.from_numpy(np.ascontiguousarray(observations)).to(torch.float32) * suite.scale
+    encoded: Float = encoder(scaled, generator).numpy()
+    return np.broadcast_to(encoded, (config.network.timesteps, *encoded.shape[1:]))
+
+
+def read_out(outputs_TBA: Float, readout: str, beta: float) -> Float:
+    """Q ``[B, A]`` from the head's outputs over time: their mean, or the last or largest value of an integrator."""
+    if readout == "mean":
+        return cast(Float, outputs_TBA.mean(axis=0))
+    membranes = [outputs_TBA[0]]
+    for output in outputs_TBA[1:]:
+        membranes.append(np.float32(beta) * membranes[-1] + output)
+    return cast(Float, membranes[-1] if readout == "last_membrane" else np.max(membranes, axis=0))
+
+
+class OnnxAgent:
+    """``decision.onnx`` in onnxruntime.
+
+    Attributes:
+        step: training step of the weights, from the file.
+    """
+
+    def __init__(self, model: Path | bytes, suite: TaskSuite, config: ExperimentConfig, threads: int = 1) -> None:
+        """Open a model.
+
+        Args:
+            model: file or bytes.
+            suite: tasks of the run that it came from.
+            config: of that run.
+            threads: of onnxruntime; with more than one a single decision is faster.
+        """
+        self.session = onnx_session(model, threads)
+        self.suite, self.config = suite, config
+        self.step = int(json.loads(self.session.get_modelmeta().custom_metadata_map["training_step"]))
+        self._inputs = [value.name for value in self.session.get_inputs()]
+        self._generator = torch.Generator()
+
+    def independent(self) -> OnnxAgent:
+        """The same session (onnxruntime's may run in several threads) with random numbers of its own."""
+        other = copy.copy(self)
+        other._generator = torch.Generator()
+        return other
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers of the ``rate`` encoding."""
+        self._generator.manual_seed(seed)
+
+    def decide(
+        self, observations: Observations, tasks_B: npt.NDArray[np.int64], encoded_TB: Float | None = None
+    ) -> dict[str, npt.NDArray[Any]]:
+        """All outputs by name; a batch may mix tasks. ``encoded_TB`` replaces the drawing of a random encoding."""
+        fed: dict[str, Any] = {}
+        if "encoded" in self._inputs:
+            drawn = encode(self.suite, self.config, observations, self._generator) if encoded_TB is None else encoded_TB
+            fed["encoded"] = np.ascontiguousarray(drawn)
+        else:
+            fed["observation"] = np.ascontiguousarray(observations)
+        if "task" in self._inputs:
+            fed["task"] = tasks_B
+        names = [value.name for value in self.session.get_outputs()]
+        return dict(zip(names, self.session.run(names, fed), strict=True))
+
+    def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]``; -inf where an action does not exist."""
+        values: npt.NDArray[np.float32] = self.decide(observation, np.full(len(observation), task))["q_values"]
+        return values
+
+
+class NirAgent:
+    """NIR files, one per task, in the reference interpreter; encoding and readout are the host's."""
+
+    def __init__(self, graphs: dict[str, nir.NIRGraph], suite: TaskSuite, config: ExperimentConfig) -> None:
+        self.suite, self.config = suite, config
+        # Only the legacy profile's IF may mean a reset by subtraction; a loop says it in its nodes.
+        self.interpreters = {
+            name: NirInterpreter(graph, reset=str(graph.metadata.get("reset", "zero")))
+            for name, graph in graphs.items()
+        }
+        self.step = int(next(iter(graphs.values())).metadata["training_step"])
+        self._generator = torch.Generator()
+
+    def independent(self) -> NirAgent:
+        """The same interpreters (a run keeps nothing) with random numbers of their own."""
+        other = copy.copy(self)
+        other._generator = torch.Generator()
+        return other
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers of the ``rate`` encoding."""
+        self._generator.manual_seed(seed)
+
+    def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]``; -inf where an action does not exist."""
+        encoded = encode(self.suite, self.config, observation, self._generator)
+        outputs, _ = self.interpreters[self.suite.names[task]].run(encoded)
+        settings = self.config.network
+        q_BA = read_out(outputs, settings.readout, settings.readout_beta)
+        return np.where(self.suite.valid_actions_KA[task], q_BA, np.float32(-np.inf))
+
+
+class ComparedAgent:
+    """An engine that plays while the trained network is asked about the same observations.
+
+    Attributes:
+        compared: for every batch of greedy decisions, how many there were, and how many had the same action.
+    """
+
+    def __init__(self, engine: DecisionMaker, reference: Agent) -> None:
+        self.engine, self.reference = engine, reference
+        self.suite, self.step = engine.suite, engine.step
+        self.compared: list[tuple[int, int]] = []
+
+    def independent(self) -> ComparedAgent:
+        """Both for another thread; what is compared there is counted here as well."""
+        other = ComparedAgent(self.engine.independent(), self.reference.independent())
+        other.compared = self.compared
+        return other
+
+    def reseed(self, seed: int) -> None:
+        """Restart both."""
+        self.engine.reseed(seed)
+        self.reference.reseed(seed)
+
+    def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
+        """The engine's Q-values; the comparison is counted."""
+        values, expected = self.engine.q_values(observation, task), self.reference.q_values(observation, task)
+        self.compared.append((len(values), int((values.argmax(axis=1) == expected.argmax(axis=1)).sum())))
+        return values

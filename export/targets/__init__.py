@@ -1,1 +1,0 @@
-"""Hardware targets: one YAML file per chip and source (see :mod:`switchmt_snn.export.energy`)."""

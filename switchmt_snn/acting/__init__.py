@@ -1,0 +1,1 @@
+"""Trained networks that act: agents and their evaluation."""

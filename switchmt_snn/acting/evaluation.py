@@ -1,0 +1,251 @@
+"""Evaluation: episodes of each task under a stated protocol, raw scores, and what they mean beside known scores."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.config import EvaluationConfig, TasksConfig
+from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.suite import TaskSuite
+
+QFunction = Callable[[npt.NDArray[Any], int], npt.NDArray[np.float32]]
+"""Stacked observations ``[n, ...]`` and a task -> Q-values ``[n, A]``, -inf where an action does not exist."""
+
+
+class DecisionMaker(Protocol):
+    """What an evaluation needs of an agent: the trained network is one, an exported file another."""
+
+    suite: TaskSuite
+    step: int
+
+    def independent(self) -> DecisionMaker:
+        """The same agent for another thread: it shares nothing with this one that changes."""
+
+    def reseed(self, seed: int) -> None:
+        """Restart the random numbers of a random encoding."""
+
+    def q_values(self, observation: npt.NDArray[Any], task: int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]`` of stacked observations ``[B, ...]``, -inf where an action does not exist."""
+
+
+@dataclass(frozen=True)
+class EvaluationProtocol:
+    """Everything that a score depends on besides the agent; printed beside every score."""
+
+    episodes: int
+    epsilon: float
+    seed: int
+    num_envs: int
+    suite: str
+    sticky_action_probability: float
+    fire_on_reset: bool
+    noop_max: int
+    frame_skip: int
+    max_episode_frames: int
+    score: str = "raw return, unclipped"
+
+    @classmethod
+    def of(cls, evaluation: EvaluationConfig, tasks: TasksConfig) -> EvaluationProtocol:
+        """The protocol that a config describes."""
+        return cls(
+            episodes=evaluation.episodes,
+            epsilon=evaluation.epsilon,
+            seed=evaluation.seed,
+            num_envs=min(evaluation.num_envs, evaluation.episodes),
+            suite=tasks.suite,
+            sticky_action_probability=tasks.sticky_action_probability,
+            fire_on_reset=tasks.fire_on_reset,
+            noop_max=tasks.noop_max,
+            frame_skip=tasks.frame_skip,
+            max_episode_frames=tasks.max_episode_frames,
+        )
+
+    def __str__(self) -> str:
+        parts = [f"{self.episodes} episodes per task", f"epsilon {self.epsilon:g}", self.score, f"seed {self.seed}"]
+        if self.suite == "gym":
+            return ", ".join(parts)
+        parts.append(f"sticky actions {self.sticky_action_probability:g}")
+        if self.suite == "atari":
+            fire = "on" if self.fire_on_reset else "off"
+            parts += [f"fire on reset {fire}", f"no-ops <= {self.noop_max}", f"frame skip {self.frame_skip}"]
+        return ", ".join([*parts, f"frame cap {self.max_episode_frames:,}"])
+
+
+@dataclass(frozen=True)
+class EpisodeScore:
+    """One evaluation episode."""
+
+    policy: str
+    task: str
+    episode: int
+    seed: int
+    score: float
+    length_steps: int
+    mean_q: float | None
+    truncated: bool
+
+
+@dataclass(frozen=True)
+class TaskScore:
+    """Summary of a task's episodes; ``human_normalized`` is ``(mean - random) / (human - random)`` of Wang 2016."""
+
+    policy: str
+    task: str
+    episodes: int
+    mean: float
+    median: float
+    standard_error: float | None
+    human_normalized: float | None
+    mean_length_steps: float
+    mean_q: float | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of an agent, and of the random policy under the same protocol."""
+
+    protocol: EvaluationProtocol
+    step: int
+    tasks: tuple[TaskScore, ...]
+    episodes: tuple[EpisodeScore, ...]
+
+    def score(self, task: str, policy: str = "agent") -> TaskScore:
+        """The summary row of a task."""
+        return next(row for row in self.tasks if row.task == task and row.policy == policy)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, without the single episodes."""
+        return {"step": self.step, "protocol": asdict(self.protocol), "tasks": [asdict(row) for row in self.tasks]}
+
+
+def evaluate_agent(
+    agent: DecisionMaker, protocol: EvaluationProtocol, tasks: tuple[str, ...] | None = None
+) -> Evaluation:
+    """Play ``protocol.episodes`` episodes of each task with the agent and with the random policy.
+
+    Deterministic for a protocol: an episode's environment and its random actions come from (seed, task, episode), and
+    ``protocol.num_envs`` episodes are played side by side. The groups are spread over all cores.
+
+    Raises:
+        TaskError: a task is not one of the agent's.
+    """
+    suite = agent.suite
+    names = tasks or suite.names
+    groups = [
+        (policy, suite.index(name), range(first, min(first + protocol.num_envs, protocol.episodes)))
+        for policy in ("agent", "random")
+        for name in names
+        for first in range(0, protocol.episodes, protocol.num_envs)
+    ]
+
+    def played(group: tuple[str, int, range]) -> list[EpisodeScore]:
+        policy, task, numbers = group
+        if policy == "random":
+            return play_episodes(policy, None, suite, task, numbers, protocol.seed, 1.0)
+        own = agent.independent()
+        own.reseed(episode_seed(protocol.seed, task, numbers[0]))
+        return play_episodes(policy, own.q_values, suite, task, numbers, protocol.seed, protocol.epsilon)
+
+    with all_cores() as pool:
+        episodes = [episode for group in pool.map(played, groups) for episode in group]
+    rows = []
+    for policy in ("agent", "random"):
+        for name in names:
+            rows.append(summarize(suite, [e for e in episodes if e.policy == policy and e.task == name]))
+    return Evaluation(protocol, agent.step, tuple(rows), tuple(episodes))
+
+
+def play_episodes(
+    policy: str,
+    q_function: QFunction | None,
+    suite: TaskSuite,
+    task: int,
+    numbers: Sequence[int],
+    seed: int,
+    epsilon: float,
+) -> list[EpisodeScore]:
+    """Play episodes of a task side by side with epsilon-greedy actions.
+
+    Args:
+        policy: its name in the scores.
+        q_function: None plays at random.
+        suite: the tasks.
+        task: index.
+        numbers: of the episodes.
+        seed: root of the episodes' seeds.
+        epsilon: share of random actions.
+    """
+    play = Play(suite, task, len(numbers))
+    try:
+        return sorted(_played(policy, q_function, suite, play, numbers, seed, epsilon), key=lambda e: e.episode)
+    finally:
+        play.close()
+
+
+def _played(
+    policy: str,
+    q_function: QFunction | None,
+    suite: TaskSuite,
+    play: Play,
+    numbers: Sequence[int],
+    seed: int,
+    epsilon: float,
+) -> Iterator[EpisodeScore]:
+    n, task = play.num_envs, play.task
+    valid = np.flatnonzero(suite.valid_actions_KA[task])
+    rngs = [np.random.default_rng([seed, task, number]) for number in numbers]
+    seeds = np.asarray([episode_seed(seed, task, number) for number in numbers], np.int64)
+    running, q_sums = np.ones(n, np.bool_), np.zeros(n)
+    play.begin(np.arange(n), seeds)
+    while running.any():
+        explore = np.asarray([rng.random() < epsilon for rng in rngs])
+        actions = np.asarray([valid[rng.integers(len(valid))] for rng in rngs], np.int64)
+        if q_function is not None:
+            asked = np.flatnonzero(running)
+            q_nA = q_function(play.observations[asked], task)
+            q_sums[asked] += q_nA.max(axis=1)
+            actions[asked] = np.where(explore[asked], actions[asked], q_nA.argmax(axis=1))
+        played = play.step(actions)
+        for env in played.ended:
+            if running[env]:
+                length = int(play.lengths_steps[env])
+                yield EpisodeScore(
+                    policy=policy,
+                    task=suite.names[task],
+                    episode=numbers[env],
+                    seed=int(seeds[env]),
+                    score=float(play.returns[env]),
+                    length_steps=length,
+                    mean_q=None if q_function is None else float(q_sums[env]) / length,
+                    truncated=bool(played.truncated[env]) and not bool(played.terminated[env]),
+                )
+            running[env] = False
+            # An idle copy starts its episode again, unobserved: environments must not be stepped past an end.
+            play.begin(np.asarray([env]), seeds[env : env + 1])
+
+
+def summarize(suite: TaskSuite, episodes: list[EpisodeScore]) -> TaskScore:
+    """Mean, median, standard error and human-normalised mean of one policy's episodes of one task."""
+    scores = np.asarray([episode.score for episode in episodes])
+    name = episodes[0].task
+    reference = suite.references.get(name)
+    mean = float(scores.mean())
+    q = [episode.mean_q for episode in episodes if episode.mean_q is not None]
+    return TaskScore(
+        policy=episodes[0].policy,
+        task=name,
+        episodes=len(scores),
+        mean=mean,
+        median=float(np.median(scores)),
+        standard_error=float(scores.std(ddof=1)) / math.sqrt(len(scores)) if len(scores) > 1 else None,
+        human_normalized=(mean - reference.random) / (reference.human - reference.random) if reference else None,
+        mean_length_steps=float(np.mean([episode.length_steps for episode in episodes])),
+        mean_q=float(np.mean(q)) if q else None,
+    )

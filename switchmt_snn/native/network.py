@@ -1,0 +1,222 @@
+"""A network's decision through the native neuron layers: the same function as :meth:`QNetwork.decide`.
+
+Synaptic products are :mod:`switchmt_snn.native.products`', neurons :mod:`switchmt_snn.native.neurons`'s, and
+channels lie innermost. For autograd, all from the encoded inputs to the heads' outputs is one operation.
+
+Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons
+of all streams, A actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from switchmt_snn.native.neurons import Currents, Form, Neurons, Spikes, batch_moments, scaled_images
+from switchmt_snn.native.products import Gradients, Synapses, connected, convolved, spikes_as_bits
+from switchmt_snn.native.streams import Gains, Heads
+from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
+
+WayBack = Callable[[Tensor], list[Tensor]]
+"""From the gradient of the heads' outputs to those of :attr:`NativeNetwork._differentiated`."""
+
+
+class TaskView(NamedTuple):
+    """What a task changes in a network, until its parameters change."""
+
+    task: int
+    gain_N: Tensor
+    """Of the dendrites of all streams, one after the other."""
+    context: Context
+
+
+class NativeNetwork:
+    """Q-values of a network that is read at every call.
+
+    With ``torch.bfloat16``, weights, synaptic products and the gradients of products and inputs are rounded to it, as
+    under autocast; biases and the gradients of weights are not, except in PyTorch's products. All else is float32.
+    Everything is on the CPU. A change of parameters through ``.data`` is not seen.
+
+    Attributes:
+        copies: what products read instead of parameters, by parameter; images have channels innermost.
+    """
+
+    def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
+        """Raises ValueError for a network that the native engine has no code for."""
+        self._network = network
+        self._parameters = list(network.parameters())
+        self._dtype = torch.float32 if precision is None else precision
+        form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
+        neurons = self._neurons = Neurons(network.config)
+        self._is_mean = network.config.readout == "mean"
+        self._last_form: Form = "mean" if self._is_mean else "floats"
+        self._trunk = {
+            name: _Layer(cast(TrunkLayer, layer), self._dtype, neurons, form) for name, layer in network.trunk.items()
+        }
+        streams = [cast(Stream, stream) for stream in network.streams.values()]
+        self._streams = Synapses([stream.synapses for stream in streams], self._dtype)
+        self._gains = Gains(streams)
+        self._synapses = [*(layer.synapses for layer in self._trunk.values()), self._streams]
+        self._heads = Heads(network)
+        of_trunk = [part for layer in self._trunk.values() for part in layer.parameters]
+        of_streams = (*self._streams.parameters, *self._gains.parameters, *self._heads.parameters)
+        self._differentiated = (*of_trunk, *of_streams)
+        self.copies = {part: copy for synapses in self._synapses for part, copy in synapses.copies.items()}
+        self._copied_version = self._version = -1
+        self._by_task: dict[int, TaskView] = {}
+        self._contexts: dict[int, Context] = {}
+
+    def inputs(self, observation: Tensor, generator: torch.Generator) -> Tensor:
+        """Encoded inputs ``[S, B, H, W, C]`` or ``[S, B, C]`` in the products' dtype for raw observations."""
+        network = self._network
+        if network.config.encoding == "direct" and observation.dtype == torch.uint8 and observation.dim() == 4:
+            images = scaled_images(observation, network.observation.scale, self._dtype)
+            return images.permute(0, 2, 3, 1).unsqueeze(0)
+        x = network.encode(observation, generator).to(self._dtype)
+        return x.movedim(2, -1).contiguous()
+
+    def copies_are_true(self) -> bool:
+        """Whether all :attr:`copies` are those of the parameters as they are now."""
+        return self._version_now() == self._copied_version
+
+    def note_true_copies(self) -> None:
+        """Who changed parameters has changed their copies as well; else :meth:`view` makes them anew."""
+        self._copied_version = self._version_now()
+
+    def _version_now(self) -> int:
+        return sum(parameter._version for parameter in self._parameters)
+
+    def view(self, task: int) -> TaskView:
+        """The network as a task sees it, its parameters as they are now.
+
+        Raises:
+            IndexError: there is no such task.
+        """
+        version = self._version_now()
+        if version != self._version:
+            if version != self._copied_version:
+                for synapses in self._synapses:
+                    synapses.read()
+            self._heads.read()
+            self._copied_version = self._version = version
+            self._by_task = {}
+        if task not in self._by_task:
+            gain_N = self._gains.of_task(task)
+            if task not in self._contexts:
+                self._contexts[task] = self._network.context(task)  # views, which see changes
+            self._by_task[task] = TaskView(task, gain_N, self._contexts[task])
+        return self._by_task[task]
+
+    def decide(self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
+        """Q-values ``[B, A]`` of :meth:`inputs`, normalised as ``training`` says; and after them those of other inputs,
+        normalised by the running statistics. Only the first ones of training have a gradient."""
+        if training and torch.is_grad_enabled():
+            outputs = _Decision.apply(self, x, view, beside, *self._differentiated)  # type: ignore[no-untyped-call]
+        else:
+            with torch.no_grad():
+                outputs, _ = self._outputs(x, view, training, beside, None)
+        if self._is_mean:
+            return list(outputs)
+        return [self._network.highest(self._network.integrate(output_TBA)) for output_TBA in outputs]
+
+    def _outputs(
+        self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor], layers: list[Gradients] | None
+    ) -> tuple[list[Tensor], WayBack]:
+        """What the heads send on, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``; and the first one's way back, through
+        what is appended to ``layers``."""
+        others = [self._features(other, view, training=False) for other in beside]  # first: training moves averages
+        ys, of_streams = connected([self._features(x, view, training, layers), *others], self._streams)
+        fired = [self._neurons.fire(y_TBN, Currents(view.gain_N), self._last_form) for y_TBN in ys]
+        outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
+        # The way back holds on to nothing of the others, nor to what it leads back from.
+        y_TBN, (spikes_SBN, currents_4N), shape = ys[0], fired[0], outputs[0].shape
+        task, version = view.task, self._version
+
+        def way_back(grad: Tensor) -> list[Tensor]:
+            if not layers:
+                raise RuntimeError("a second way back, expected one for each decision")
+            if self._version_now() != version:
+                raise RuntimeError("parameters have changed since the decision, expected its gradient first")
+            steps, grad_SBA = self._neurons.timesteps, grad.contiguous().view(shape)
+            scale = 1.0 / steps if self._is_mean else 1.0
+            grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBA, scale)
+            grad_y, (grad_gain_N, _) = self._neurons.unfire(y_TBN, currents_4N, grad_SBN.expand(steps, -1, -1))
+            of_gains = self._gains.gradients(task, grad_gain_N)
+            grad_x, of_synapses = of_streams(grad_y, True)
+            parts = [*of_synapses, *of_gains, *of_heads]
+            while layers:  # what a layer kept is let go
+                of_layer = layers.pop()
+                grad_x, some = of_layer(cast(Tensor, grad_x), bool(layers))
+                parts = [*some, *parts]
+            return parts
+
+        return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], way_back
+
+    def _features(self, x: Tensor, view: TaskView, training: bool, layers: list[Gradients] | None = None) -> Spikes:
+        """What the trunk sends to the streams; each layer's way back is appended to ``layers``, if there is one."""
+        spikes = Spikes(x, x.shape[-1])
+        for name, layer in self._trunk.items():
+            spikes, gradients = layer.fire(spikes, view.context[name], training)
+            if layers is not None:
+                layers.append(gradients)
+        return spikes
+
+
+class _Layer:
+    """A layer of the trunk: products, normalisation if it has one, neurons."""
+
+    def __init__(self, layer: TrunkLayer, dtype: torch.dtype, neurons: Neurons, form: Form) -> None:
+        module = layer.synapses[-1] if isinstance(layer.synapses, nn.Sequential) else layer.synapses
+        self.synapses = Synapses([cast(nn.Linear | nn.Conv2d, module)], dtype)
+        self._normalization, self._neurons, self._form = layer.normalization, neurons, form
+        self.parameters = self.synapses.parameters
+        if self._normalization is None:
+            self._currents = Currents(torch.ones(len(self.synapses.bias)))
+        else:
+            affine = self._normalization.weight, self._normalization.bias
+            self.parameters += affine
+            weight_C, bias_C = (part.detach() for part in affine)
+            self._currents = Currents(weight_C, bias_C, epsilon=self._normalization.epsilon)
+
+    def fire(self, x: Spikes, context: tuple[Tensor, ...], training: bool) -> tuple[Spikes, Gradients]:
+        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and from their gradient to those of ``x`` and the parameters."""
+        neurons, normalization, currents = self._neurons, self._normalization, self._currents
+        if normalization is None:
+            (y,), of_products = connected([x], self.synapses)
+            y_SRC = y
+        else:
+            y, of_products = convolved(x, self.synapses)
+            y_SRC, (mean_C, var_C) = y.flatten(1, -2), context
+            if training:
+                mean_C, var_C = batch_moments(y_SRC, (mean_C, var_C), normalization.momentum)
+            currents = currents._replace(mean_C=mean_C, variance_C=var_C)
+        memory, currents_4C = neurons.fire(y_SRC, currents, self._form)
+
+        def gradients(grad: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
+            grad_TRC = grad.view(neurons.timesteps, *y_SRC.shape[1:])
+            grad_y, grad_2C = neurons.unfire(y_SRC, currents_4C, grad_TRC)
+            grad_x, parts = of_products(grad_y, of_inputs)
+            return grad_x, parts if normalization is None else [*parts, *grad_2C]
+
+        shape = (neurons.timesteps, *y.shape[1:-1], memory.shape[-1])
+        return Spikes(memory.view(shape), y.shape[-1], self._form == "bits"), gradients
+
+
+class _Decision(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, network: NativeNetwork, x: Tensor, view: TaskView, beside: Sequence[Tensor], *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        outputs, ctx.way_back = network._outputs(x, view, True, beside, [])
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(*outputs[1:])
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, None, None, *ctx.way_back(gradients[0])

@@ -1,0 +1,1 @@
+"""Replay memory: one ring per task, every frame stored once."""

@@ -1,0 +1,278 @@
+"""Replay memory of one task (buffer D_i of Algorithm 1): every frame is stored once.
+
+Shapes: L lanes (one per environment copy), N slots per lane, B batch, k stacked frames.
+
+A lane is a ring of slots. A slot holds a frame and, if the agent acted on it, what followed: the transition's next
+frame is the next slot's. The last frame of an episode has a slot of its own without an action, so the next observation
+is right at termination and truncation, and no stack crosses an episode border (frames before the start are zeros).
+
+Old frames leave in blocks of a few slots: when the first slot of a block is overwritten, and the oldest while frames
+take more bytes than they may. Frames lie plain or compressed (:mod:`switchmt_snn.replay.frames`), or on
+the learner's device (:mod:`switchmt_snn.replay.on_device`); else all is alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from switchmt_snn.replay.frames import CompressedFrames, FrameStore, PlainFrames
+from switchmt_snn.replay.on_device import DeviceFrames
+
+BLOCK_SLOTS = 16
+"""Frames that leave, and are compressed, together. Fewer take more bytes; of more, one frame takes longer to read."""
+SEGMENT_SLOTS = 1024
+"""Slots per stored segment (see :meth:`FrameReplay.segments`)."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Sampled transitions of one task; observations are stacked ``[B, k*c, ...]`` (tensors where frames lie on the
+    learner's device), rewards raw."""
+
+    observations: npt.NDArray[Any] | Tensor
+    actions: npt.NDArray[np.int64]
+    rewards: npt.NDArray[np.float32]
+    next_observations: npt.NDArray[Any] | Tensor
+    terminated: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Frames of consecutive slots of a lane, for storing. A complete one never changes again."""
+
+    lane: int
+    number: int
+    complete: bool
+
+
+class FrameReplay:
+    """A ring of the newest transitions of one task.
+
+    Attributes:
+        transitions_added: transitions ever added.
+    """
+
+    DERIVED = ("stack", "slots", "num_lanes", "block_slots", "max_bytes", "_frames", "frame_shape", "frame_dtype")
+
+    def __init__(
+        self,
+        capacity_steps: int,
+        num_lanes: int,
+        frame_shape: tuple[int, ...],
+        dtype: npt.DTypeLike,
+        stack: int,
+        compressed: bool = False,
+        max_bytes: int | None = None,
+        device: torch.device | None = None,
+    ) -> None:
+        """Reserve the ring; the system hands out an array's memory as frames come in, a tensor's at once.
+
+        Args:
+            capacity_steps: slots over all lanes. An episode's last frame takes one, too.
+            num_lanes: environment copies that add to it.
+            frame_shape: one frame, ``(c, H, W)`` or ``(features,)``.
+            dtype: of a frame.
+            stack: frames k per observation.
+            compressed: keep frames compressed, without loss.
+            max_bytes: the oldest blocks leave while compressed frames take more.
+            device: keep frames in a tensor there, and sample observations as tensors there; not compressed.
+        """
+        self.stack = stack
+        self.slots = capacity_steps // num_lanes
+        self.num_lanes = num_lanes
+        self.frame_shape, self.frame_dtype = frame_shape, np.dtype(dtype)
+        # A ring of few slots cannot do without many of them at once.
+        self.block_slots = BLOCK_SLOTS if self.slots >= 8 * BLOCK_SLOTS else 1
+        self.max_bytes = max_bytes if compressed else None
+        form = (num_lanes, self.slots, frame_shape, dtype)
+        self._frames: FrameStore
+        if compressed:
+            self._frames = CompressedFrames(*form, self.block_slots)
+        else:
+            self._frames = PlainFrames(*form) if device is None else DeviceFrames(*form, device)
+        flat = self.slots * num_lanes
+        self._actions = np.full(flat, -1, np.int16)
+        self._rewards = np.zeros(flat, np.float32)
+        self._terminated = np.zeros(flat, np.bool_)
+        self._age = np.zeros(flat, np.uint8)  # steps since the episode's start, at most stack - 1
+        self._valid = np.zeros(flat, np.bool_)  # a transition whose frames are all still there
+        self._written = np.zeros(num_lanes, np.int64)  # slots ever written, per lane
+        self._oldest = np.zeros(num_lanes, np.int64)  # position of the oldest frame held, per lane
+        self.transitions_added = 0
+
+    def __len__(self) -> int:
+        """Transitions that can be sampled."""
+        return int(self._valid.sum())
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of everything that is held: frames, actions, rewards, flags."""
+        return self._frames.nbytes + sum(array.nbytes for array in self._arrays().values())
+
+    def begin(self, lane: int, frame: npt.NDArray[Any]) -> None:
+        """Start an episode in a lane with its first frame; what came before keeps its last frame."""
+        self._write(lane, frame, age=0)
+
+    def add(self, lane: int, action: int, reward: float, terminated: bool, next_frame: npt.NDArray[Any]) -> None:
+        """Add the transition from a lane's newest frame. At an episode's end, :meth:`begin` must follow."""
+        slot = self._slot(lane, self._written[lane] - 1)
+        self._actions[slot] = action
+        self._rewards[slot] = reward
+        self._terminated[slot] = terminated
+        self._write(lane, next_frame, age=min(int(self._age[slot]) + 1, self.stack - 1))
+        self._valid[slot] = True
+        self.transitions_added += 1
+
+    def _slot(self, lane: int, position: Any) -> Any:
+        return lane * self.slots + position % self.slots
+
+    def _write(self, lane: int, frame: npt.NDArray[Any], age: int) -> None:
+        position = int(self._written[lane])
+        slot = self._slot(lane, position)
+        if position >= self.slots and position % self.slots % self.block_slots == 0:
+            self._drop_before(lane, position - self.slots + self._block_length(position))
+        self._valid[slot] = False
+        self._actions[slot] = -1
+        self._rewards[slot] = 0.0
+        self._terminated[slot] = False
+        self._frames.write(lane, position % self.slots, frame)
+        self._age[slot] = age
+        self._written[lane] = position + 1
+        while self.max_bytes is not None and self._frames.nbytes > self.max_bytes:
+            held = self._written - self._oldest
+            fullest = int(held.argmax())
+            if held[fullest] <= 2 * self.block_slots + self.stack:
+                break  # less than that is no memory; the open blocks alone take as much
+            oldest = int(self._oldest[fullest])
+            self._frames.drop(fullest, oldest % self.slots)
+            self._drop_before(fullest, oldest + self._block_length(oldest))
+
+    def _block_length(self, position: int) -> int:
+        """Slots of the block at whose start a position is; the last block of a lane may be shorter."""
+        return min(self.block_slots, self.slots - position % self.slots)
+
+    def _drop_before(self, lane: int, oldest: int) -> None:
+        """Make ``oldest`` the oldest position held; spoils every transition that needs an older frame."""
+        gone = np.arange(int(self._oldest[lane]), oldest)
+        self._valid[self._slot(lane, gone)] = False
+        for distance in range(self.stack - 1):
+            later = self._slot(lane, oldest + distance)
+            if self._age[later] > distance:
+                self._valid[later] = False
+        self._oldest[lane] = max(int(self._oldest[lane]), oldest)
+
+    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+        """Draw transitions uniformly, with replacement.
+
+        Raises:
+            ValueError: nothing can be sampled yet.
+        """
+        if not self._valid.any():
+            raise ValueError("the replay holds no transition; add some before sampling")
+        filled = min(int(self._written.max()), self.slots)
+        chosen = np.empty(0, np.int64)
+        while len(chosen) < batch_size:  # rejection: uniform over the valid slots
+            draw = rng.integers(0, self.num_lanes * filled, size=batch_size - len(chosen))
+            slots = draw // filled * self.slots + draw % filled
+            chosen = np.concatenate([chosen, slots[self._valid[slots]]])
+        return self.gather(chosen)
+
+    def gather(self, slots: npt.NDArray[np.int64]) -> Batch:
+        """The transitions that start in these (flat) slots."""
+        k = self.stack
+        lanes_B1, within_B1 = slots[:, None] // self.slots, slots[:, None] % self.slots
+        back = np.arange(k - 1, -2, -1)[None, :]  # k-1 ... 0 for the observation, -1 for the next frame
+        sources = lanes_B1 * self.slots + (within_B1 - back) % self.slots
+        before_start = back > self._age[slots][:, None]
+        frames = self._frames.read(np.where(before_start, -1, sources))  # [B, k+1, c, ...]
+        shape = (len(slots), k * frames.shape[2], *frames.shape[3:])
+        return Batch(
+            observations=frames[:, :k].reshape(shape),
+            actions=self._actions[slots].astype(np.int64),
+            rewards=self._rewards[slots],
+            next_observations=frames[:, 1:].reshape(shape),
+            terminated=self._terminated[slots],
+        )
+
+    def valid_slots(self) -> npt.NDArray[np.int64]:
+        """All slots that can be sampled, for tests and for going through the memory in order."""
+        return np.flatnonzero(self._valid)
+
+    # Storing: small arrays as state, frames as segments.
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the frames."""
+        return {
+            "written": self._written.copy(),
+            "oldest": self._oldest.copy(),
+            "transitions_added": self.transitions_added,
+            **{name: np.concatenate(list(self._by_lane(array))) for name, array in self._arrays().items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put everything but the frames back; :meth:`load_segment` brings the frames."""
+        self._written[:] = state["written"]
+        self._oldest[:] = state["oldest"]
+        self.transitions_added = int(state["transitions_added"])
+        for name, array in self._arrays().items():
+            offset = 0
+            for part in self._by_lane(array):
+                part[:] = state[name][offset : offset + len(part)]
+                offset += len(part)
+
+    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {
+            "actions": self._actions,
+            "rewards": self._rewards,
+            "terminated": self._terminated,
+            "age": self._age,
+            "valid": self._valid,
+        }
+
+    def _by_lane(self, array: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:
+        """The written part of each lane (a view)."""
+        for lane in range(self.num_lanes):
+            start = lane * self.slots
+            yield array[start : start + min(int(self._written[lane]), self.slots)]
+
+    def segments(self) -> Iterator[Segment]:
+        """The segments that cover the frames held now, oldest first in each lane."""
+        for lane in range(self.num_lanes):
+            written = int(self._written[lane])
+            first = int(self._oldest[lane]) // SEGMENT_SLOTS
+            for number in range(first, -(-written // SEGMENT_SLOTS)):
+                yield Segment(lane, number, (number + 1) * SEGMENT_SLOTS <= written)
+
+    def read_segment(self, segment: Segment) -> npt.NDArray[Any]:
+        """Frames of a segment as far as they are written ``[<= SEGMENT_SLOTS, c, ...]``; zeros where one has left."""
+        written, oldest = int(self._written[segment.lane]), int(self._oldest[segment.lane])
+        start = segment.number * SEGMENT_SLOTS
+        positions = np.arange(start, min(start + SEGMENT_SLOTS, written))
+        frames = self._frames.read(np.where(positions < oldest, -1, self._slot(segment.lane, positions)))
+        return frames.cpu().numpy() if isinstance(frames, Tensor) else frames
+
+    def load_segment(self, segment: Segment, frames: npt.NDArray[Any]) -> None:
+        """Put the frames of a segment back that are still held; a lane's segments must come in order."""
+        written, oldest = int(self._written[segment.lane]), int(self._oldest[segment.lane])
+        positions = segment.number * SEGMENT_SLOTS + np.arange(len(frames))
+        for position, frame in zip(positions.tolist(), frames, strict=True):
+            if oldest <= position < written:
+                self._frames.write(segment.lane, position % self.slots, frame)
+
+    def check_valid(self) -> None:
+        """Assert the invariants (tests call it after random operations)."""
+        for slot in self.valid_slots():
+            lane, within = divmod(int(slot), self.slots)
+            newest = (int(self._written[lane]) - 1) % self.slots
+            behind_newest = (newest - within) % self.slots
+            held = int(self._written[lane] - self._oldest[lane])
+            assert self._actions[slot] >= 0, "a valid slot has an action"
+            assert behind_newest >= 1, "a valid slot has a next frame"
+            assert behind_newest + int(self._age[slot]) < held, "a valid slot's stack is held"

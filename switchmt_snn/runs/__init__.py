@@ -1,0 +1,1 @@
+"""Runs: planned, driven, saved in a run folder."""

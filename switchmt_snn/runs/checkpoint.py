@@ -1,0 +1,337 @@
+"""Checkpoints: a folder of safetensors and JSON with a manifest of SHA-256 sums. No pickle anywhere.
+
+    checkpoints/step-000050000/   model.safetensors  training.safetensors  state.json  manifest.json
+    checkpoints/replay/           <sha256>.zst: segments of replay frames, shared by the checkpoints
+    checkpoints/best/             model.safetensors  manifest.json
+
+A checkpoint is written to a temporary folder and renamed, so it exists whole or not at all; the one before it is
+removed only after that. Frames of a full replay segment are written once, however many checkpoints refer to them.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+import zstandard
+
+from switchmt_snn.errors import CheckpointError
+from switchmt_snn.replay.ring import FrameReplay, Segment
+from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
+
+FORMAT = 3
+"""Goes up when a saved state gets another shape. 2: paused episodes of every task. Weights are read from any."""
+_STEP_DIGITS = 12
+
+
+@dataclass(frozen=True)
+class LoadedCheckpoint:
+    """A checkpoint that was read whole.
+
+    Attributes:
+        step: agent steps of the run.
+        state: what ``Training.state_dict`` gave.
+        log_sizes: bytes of each log file at that moment.
+        damaged: what was wrong with newer checkpoints that were passed over.
+    """
+
+    step: int
+    state: dict[str, Any]
+    log_sizes: dict[str, int]
+    damaged: tuple[str, ...]
+
+
+class CheckpointStore:
+    """The checkpoints of one run folder."""
+
+    def __init__(self, folder: Path, keep: int = 2) -> None:
+        self.folder = folder
+        self.keep = keep
+        self._replay_folder = folder / "replay"
+        self._stored: dict[tuple[int, int, int], dict[str, Any]] = {}
+
+    # Writing
+
+    def save(self, step: int, state: dict[str, Any], replays: list[FrameReplay], log_sizes: dict[str, int]) -> Path:
+        """Write a checkpoint, then drop the ones that are too old.
+
+        Raises:
+            OSError: the disk is full or not writable; older checkpoints are untouched.
+        """
+        self._replay_folder.mkdir(parents=True, exist_ok=True)
+        segments = [entry for task, replay in enumerate(replays) for entry in self._store_segments(task, replay)]
+        final = self.folder / _name(step)
+        if final.is_dir() and self._is_whole(final):
+            return final  # saved already at this very step, and a step has one state
+        temporary = self.folder / f".{final.name}.tmp"
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        try:
+            model, training, tree = _split(state)
+            files = {
+                "model.safetensors": safetensors.torch.save(model),
+                "training.safetensors": safetensors.torch.save(training),
+                "state.json": json.dumps(tree).encode(),
+            }
+            self._write_folder(temporary, files, {"step": step, "segments": segments, "logs": log_sizes})
+            if final.exists():
+                shutil.rmtree(final)
+            temporary.rename(final)
+        except OSError:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+        sync_folder(self.folder)
+        self._remove_old()
+        return final
+
+    def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float) -> None:
+        """Keep these weights as the best so far (weights only)."""
+        temporary, final = self.folder / ".best.tmp", self.folder / "best"
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        try:
+            model = {name: tensor.detach().cpu().contiguous() for name, tensor in network_state.items()}
+            files = {"model.safetensors": safetensors.torch.save(model)}
+            self._write_folder(temporary, files, {"step": step, "score": score, "segments": [], "logs": {}})
+            shutil.rmtree(final, ignore_errors=True)
+            temporary.rename(final)
+        except OSError:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+
+    def best_score(self) -> float | None:
+        """Score of the best weights, if there are any."""
+        try:
+            return float(_read_manifest(self.folder / "best")["score"])
+        except CheckpointError:
+            return None
+
+    def _write_folder(self, folder: Path, files: dict[str, bytes], facts: dict[str, Any]) -> None:
+        for name, content in files.items():
+            write_atomically(folder / name, content)
+        sums = {name: sha256(content) for name, content in files.items()}
+        manifest = {"format": FORMAT, "program": "switchmt-snn", **facts, "files": sums}
+        sealed = {**manifest, "seal": _seal(manifest)}
+        write_atomically(folder / "manifest.json", json.dumps(sealed, indent=1).encode())
+
+    def _store_segments(self, task: int, replay: FrameReplay) -> Iterator[dict[str, Any]]:
+        for segment in replay.segments():
+            key = (task, segment.lane, segment.number)
+            entry = self._stored.get(key)
+            if entry is None or not segment.complete:
+                content = zstandard.compress(np.ascontiguousarray(replay.read_segment(segment)).tobytes(), 3)
+                digest = sha256(content)
+                path = self._replay_folder / f"{digest}.zst"
+                if not path.exists() or sha256(path.read_bytes()) != digest:  # absent, or damaged
+                    write_atomically(path, content)
+                entry = {"task": task, "lane": segment.lane, "number": segment.number, "sha256": digest}
+                if segment.complete:
+                    self._stored[key] = entry
+            yield entry
+
+    def _remove_old(self) -> None:
+        for path in self.paths()[self.keep :]:
+            # Without its manifest a half-removed folder is no checkpoint any more.
+            (path / "manifest.json").unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True)
+        used = set()
+        for path in self.paths():
+            try:
+                used |= {entry["sha256"] for entry in _read_manifest(path)["segments"]}
+            except CheckpointError:
+                return  # a damaged manifest: its segments are unknown, so none is removed
+        for path in [*self._replay_folder.glob("*.zst"), *self._replay_folder.glob(".*.tmp")]:
+            if path.stem not in used:
+                path.unlink(missing_ok=True)
+        current = {key: entry for key, entry in self._stored.items() if entry["sha256"] in used}
+        self._stored = current
+
+    # Reading
+
+    def paths(self) -> list[Path]:
+        """Checkpoint folders, newest first."""
+        return sorted((path for path in self.folder.glob("step-*") if path.is_dir()), reverse=True)
+
+    def load(self, replays: list[FrameReplay]) -> LoadedCheckpoint:
+        """Read the newest checkpoint that is whole; fills the replays with frames and small arrays.
+
+        Raises:
+            CheckpointError: there is none, or none is whole.
+        """
+        damaged: list[str] = []
+        for path in self.paths():
+            try:
+                return self._load_one(path, replays, tuple(damaged))
+            except CheckpointError as error:
+                damaged.append(f"checkpoint {path.name} is damaged ({error})")
+        if damaged:
+            raise CheckpointError(
+                f"no whole checkpoint in {self.folder}: {'; '.join(damaged)}; expected at least one; "
+                "start again in another folder with --run"
+            )
+        raise CheckpointError(f"no checkpoint in {self.folder}, expected one; run switchmt-snn train first")
+
+    def _load_one(self, path: Path, replays: list[FrameReplay], damaged: tuple[str, ...]) -> LoadedCheckpoint:
+        manifest = _read_manifest(path)
+        if manifest["format"] < FORMAT:
+            raise CheckpointError(f"format {manifest['format']} can be evaluated, but only {FORMAT} can be continued")
+        model = _read_tensors(path, "model.safetensors", manifest)
+        training = _read_tensors(path, "training.safetensors", manifest)
+        tree = _read_json(_read_file(path, "state.json", manifest), "state.json")
+        state = _join(tree, model, training)
+        contents = [self._read_segment(entry) for entry in manifest["segments"]]
+        # Nothing is changed before everything was read.
+        for task, replay in enumerate(replays):
+            replay.load_state_dict(state["replays"][str(task)])
+        for entry, content in zip(manifest["segments"], contents, strict=True):
+            replay = replays[entry["task"]]
+            segment = Segment(entry["lane"], entry["number"], complete=True)
+            frames = np.frombuffer(zstandard.decompress(content), replay.frame_dtype).reshape(-1, *replay.frame_shape)
+            replay.load_segment(segment, frames)
+        complete = {(task, s.lane, s.number) for task, r in enumerate(replays) for s in r.segments() if s.complete}
+        keyed = {(entry["task"], entry["lane"], entry["number"]): entry for entry in manifest["segments"]}
+        self._stored = {key: entry for key, entry in keyed.items() if key in complete}
+        return LoadedCheckpoint(int(manifest["step"]), state, dict(manifest["logs"]), damaged)
+
+    def _is_whole(self, path: Path) -> bool:
+        """Whether a checkpoint and the segments it refers to can be read as they were written."""
+        try:
+            manifest = _read_manifest(path)
+            for name in manifest["files"]:
+                _read_file(path, name, manifest)
+            for entry in manifest["segments"]:
+                self._read_segment(entry)
+        except CheckpointError:
+            return False
+        return True
+
+    def _read_segment(self, entry: dict[str, Any]) -> bytes:
+        path = self._replay_folder / f"{entry['sha256']}.zst"
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise CheckpointError(f"replay segment {path.name[:12]} cannot be read") from error
+        if sha256(content) != entry["sha256"]:
+            raise CheckpointError(f"replay segment {path.name[:12]} has another checksum")
+        return content
+
+    def load_model(self, which: str = "last") -> tuple[int, dict[str, torch.Tensor], tuple[str, ...]]:
+        """Weights of the last whole checkpoint or of the best one: step, state dict, damaged checkpoints passed over.
+
+        Raises:
+            CheckpointError: there is none, or none is whole.
+        """
+        damaged: list[str] = []
+        for path in [self.folder / "best"] if which == "best" else self.paths():
+            try:
+                manifest = _read_manifest(path)
+                return int(manifest["step"]), _read_tensors(path, "model.safetensors", manifest), tuple(damaged)
+            except CheckpointError as error:
+                damaged.append(f"checkpoint {path.name} is damaged ({error})")
+        seen = "; ".join(damaged) if damaged and which != "best" else "none"
+        remedy = "use --checkpoint last" if which == "best" else "run switchmt-snn train first"
+        raise CheckpointError(f"no whole {which} checkpoint in {self.folder} ({seen}), expected one; {remedy}")
+
+
+def _name(step: int) -> str:
+    return f"step-{step:0{_STEP_DIGITS}d}"
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = _read_json((path / "manifest.json").read_bytes(), "manifest.json")
+    except OSError as error:
+        raise CheckpointError("manifest.json cannot be read") from error
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("format"), int):
+        raise CheckpointError("manifest.json is not a manifest")
+    if manifest["format"] > FORMAT:
+        raise CheckpointError(f"format {manifest['format']} is newer than {FORMAT}; update switchmt-snn")
+    if manifest.pop("seal", None) != _seal(manifest):
+        raise CheckpointError("manifest.json has another checksum")
+    return manifest
+
+
+def _seal(manifest: dict[str, Any]) -> str:
+    """Checksum of a manifest's own content."""
+    return sha256(json.dumps(manifest, sort_keys=True).encode())
+
+
+def _read_json(content: bytes, name: str) -> Any:
+    try:
+        return json.loads(content)
+    except ValueError as error:
+        raise CheckpointError(f"{name} is not JSON") from error
+
+
+def _read_file(path: Path, name: str, manifest: dict[str, Any]) -> bytes:
+    try:
+        content = (path / name).read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{name} cannot be read") from error
+    if sha256(content) != manifest["files"].get(name):
+        raise CheckpointError(f"{name} has another checksum")
+    return content
+
+
+def _read_tensors(path: Path, name: str, manifest: dict[str, Any]) -> dict[str, torch.Tensor]:
+    content = _read_file(path, name, manifest)
+    try:
+        tensors: dict[str, torch.Tensor] = safetensors.torch.load(content)
+    except safetensors.SafetensorError as error:
+        raise CheckpointError(f"{name} is not a safetensors file") from error
+    return tensors
+
+
+# A nested state <-> tensors by path and a JSON tree in which {"$tensor": path} stands for a tensor.
+
+_MODEL_PREFIX = "learner/network/"
+
+
+def _split(state: dict[str, Any]) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], Any]:
+    tensors: dict[str, torch.Tensor] = {}
+
+    def walk(value: Any, path: str) -> Any:
+        if isinstance(value, torch.Tensor):
+            tensors[path] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
+            return {"$tensor": path}
+        if isinstance(value, np.ndarray):
+            tensors[path] = torch.from_numpy(np.ascontiguousarray(value).copy())
+            return {"$array": path}
+        if isinstance(value, dict):
+            return {str(key): walk(item, f"{path}/{key}" if path else str(key)) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [walk(item, f"{path}/{index}") for index, item in enumerate(value)]
+        return value
+
+    tree = walk(state, "")
+    model = {k.removeprefix(_MODEL_PREFIX): v for k, v in tensors.items() if k.startswith(_MODEL_PREFIX)}
+    training = {k: v for k, v in tensors.items() if not k.startswith(_MODEL_PREFIX)}
+    return model, training, tree
+
+
+def _join(tree: Any, model: dict[str, torch.Tensor], training: dict[str, torch.Tensor]) -> Any:
+    def find(path: str) -> torch.Tensor:
+        source = model if path.startswith(_MODEL_PREFIX) else training
+        key = path.removeprefix(_MODEL_PREFIX)
+        if key not in source:
+            raise CheckpointError(f"tensor {path} is missing")
+        return source[key]
+
+    def walk(value: Any) -> Any:
+        if isinstance(value, dict):
+            if set(value) == {"$tensor"}:
+                return find(value["$tensor"])
+            if set(value) == {"$array"}:
+                return find(value["$array"]).numpy()
+            return {key: walk(item) for key, item in value.items()}
+        return [walk(item) for item in value] if isinstance(value, list) else value
+
+    return walk(tree)

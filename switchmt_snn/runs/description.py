@@ -1,0 +1,145 @@
+"""What a config would build, before anything runs: layers, parameters, neurons, operations, memory."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any, cast
+
+import torch
+from torch import nn
+
+from switchmt_snn.config import METHOD_TRAITS, METHODS, ExperimentConfig, resolve
+from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.runs.memory import MemoryEstimate, estimate_memory
+from switchmt_snn.spiking.network import QNetwork, Stream, TrunkLayer, build_network, trainable_parameters
+from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.suite import TaskSuite
+
+
+@dataclass(frozen=True)
+class LayerDescription:
+    """One layer of synapses.
+
+    Attributes:
+        operations_per_step: dense operations of one simulation step: every weight meets every input it is wired to,
+            padding not counted (a spiking layer does at most this many accumulates per step).
+        steps: how often the layer is computed per decision (the first one once under direct encoding, the head once
+            for the mean readout).
+    """
+
+    name: str
+    kind: str
+    input_shape: tuple[int, ...]
+    output_shape: tuple[int, ...]
+    parameters: int
+    neurons: int
+    operations_per_step: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class MethodDescription:
+    """One of the seven methods under a config's other settings."""
+
+    method: str
+    trainable_parameters: int
+    neurons: int
+    timesteps: int
+    dense_operations_per_decision: int
+    neuron_updates_per_decision: int
+    switching_policy: str
+    layers: tuple[LayerDescription, ...]
+    memory: MemoryEstimate
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {**asdict(self), "memory_total_bytes": self.memory.total_bytes}
+
+
+def describe(config: ExperimentConfig) -> dict[str, MethodDescription]:
+    """Describe every method under a config's settings (those that a method cannot have fall back to its own)."""
+    suite = make_suite(config.tasks)
+    return {method: describe_method(with_method(config, method), suite) for method in METHODS}
+
+
+def with_method(config: ExperimentConfig, method: str) -> ExperimentConfig:
+    """The resolved config with another method; settings that the method cannot have take its own values."""
+    if method == config.network.method:
+        return resolve(config)
+    traits = METHOD_TRAITS[method]
+    keeps = traits.dendrites and config.network.dendrites != "none"
+    changes: dict[str, Any] = {"method": method, "dendrites": config.network.dendrites if keeps else "auto"}
+    if not traits.spiking:
+        changes |= {"encoding": "direct", "readout": "mean", "k_winners": None}
+    network = replace(config.network, **changes)
+    return resolve(replace(config, network=network, switching=replace(config.switching, policy="auto")))
+
+
+def describe_method(config: ExperimentConfig, suite: TaskSuite) -> MethodDescription:
+    """Describe the method of a resolved config."""
+    network = build_network(config.network, observation_spec(suite), config.seed)
+    layers = tuple(_layers(network))
+    neurons = sum(layer.neurons for layer in layers)
+    return MethodDescription(
+        method=config.network.method,
+        trainable_parameters=trainable_parameters(network),
+        neurons=neurons,
+        timesteps=config.network.timesteps,
+        dense_operations_per_decision=sum(layer.operations_per_step * layer.steps for layer in layers),
+        neuron_updates_per_decision=neurons * config.network.timesteps,
+        switching_policy=config.switching.policy,
+        layers=layers,
+        memory=estimate_memory(config, suite, network, neurons),
+    )
+
+
+def _layers(network: QNetwork) -> list[LayerDescription]:
+    """Shapes by one forward pass on a blank observation."""
+    config = network.config
+    activity: dict[str, torch.Tensor] = {}
+    network.eval()
+    with torch.inference_mode():
+        network(torch.zeros(1, *network.observation.shape), 0, activity=activity)
+    channels = network.encoder.input_channels(network.observation.shape[0])
+    shape: tuple[int, ...] = (channels, *network.observation.shape[1:])
+    steps = 1 if config.encoding == "direct" else config.timesteps
+    layers = []
+    for name, module in network.trunk.items():
+        layer = cast(TrunkLayer, module)
+        output = tuple(activity[name].shape[2:])
+        layers.append(_layer(name, layer, layer.synapses, shape, output, steps, neurons=True))
+        shape, steps = output, config.timesteps
+    features: tuple[int, ...] = (int(torch.tensor(shape).prod()),)
+    for name, module in network.streams.items():
+        stream = cast(Stream, module)
+        hidden, head = stream.synapses, stream.head
+        parameters = trainable_parameters(stream) - trainable_parameters(head)
+        first = _layer(f"{name}.hidden", stream, hidden, features, (hidden.out_features,), steps, neurons=True)
+        layers.append(replace(first, parameters=parameters))
+        head_steps = 1 if config.readout == "mean" else config.timesteps
+        out = (head.out_features,)
+        layers.append(_layer(f"{name}.head", head, head, (hidden.out_features,), out, head_steps, neurons=False))
+    return layers
+
+
+def _layer(
+    name: str,
+    owner: nn.Module,
+    synapses: nn.Module,
+    input_shape: tuple[int, ...],
+    output_shape: tuple[int, ...],
+    steps: int,
+    neurons: bool,
+) -> LayerDescription:
+    outputs = int(torch.tensor(output_shape).prod())
+    weight = next(parameter for parameter in synapses.parameters() if parameter.dim() > 1)
+    return LayerDescription(
+        name=name,
+        kind="Conv2d" if weight.dim() == 4 else "Linear",
+        input_shape=input_shape,
+        output_shape=output_shape,
+        parameters=trainable_parameters(owner),
+        neurons=outputs if neurons else 0,
+        operations_per_step=outputs * weight[0].numel(),
+        steps=steps,
+    )

@@ -1,0 +1,358 @@
+"""The run folder: the only product of training, and all that every other command needs.
+
+config.yaml  environment.json  metrics.jsonl  episodes.csv  switches.csv  checkpoints/  evaluations/
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import shlex
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO, Any
+
+import filelock
+import torch
+
+from switchmt_snn.acting.evaluation import Evaluation
+from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
+from switchmt_snn.errors import ConfigError, RunFolderError
+from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDecided
+from switchmt_snn.learning.switching import SwitchTo
+from switchmt_snn.runs.checkpoint import CheckpointStore
+from switchmt_snn.runs.files import write_atomically
+
+RUNS = Path("runs")
+EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncated", "epsilon", "updates", "wall_s")
+SWITCH_COLUMNS = (
+    "step",
+    "visit",
+    "task",
+    "episodes_in_visit",
+    "steps_in_visit",
+    "decision",
+    "next_task",
+    "reason",
+    "parameter_change",
+    "change_threshold",
+    "snapshots",
+    "updates_in_window",
+    "change_per_update",
+    "largest_change_per_update",
+    "change_rate_fraction",
+    "returns",
+    "reward_slope",
+    "reward_t",
+    "plateau_t",
+    "flat_episodes",
+    "parameter_says_leave",
+    "reward_says_leave",
+    "visit_episodes",
+    "visit_steps",
+)
+_PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "gymnasium", "ale-py", "minatar", "safetensors", "zstandard")
+
+
+def new_run_path(name: str) -> Path:
+    """A fresh folder under ``runs/``, named by time and config."""
+    base = RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{name}"
+    path, number = base, 2
+    while path.exists():
+        path, number = Path(f"{base}-{number}"), number + 1
+    return path
+
+
+def latest_run() -> Path:
+    """The newest run under ``runs/``.
+
+    Raises:
+        RunFolderError: there is none.
+    """
+    runs = [path.parent for path in RUNS.glob("*/environment.json")]
+    if not runs:
+        raise RunFolderError(f"no run in {RUNS.resolve()}, expected one; run switchmt-snn train, or name a run folder")
+    return max(runs, key=lambda run: ((run / "environment.json").stat().st_mtime, run.name))
+
+
+class RunFolder:
+    """Paths and facts of a run; reading needs no lock."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def is_run(self) -> bool:
+        """Whether a run of this program lives here."""
+        try:
+            facts = json.loads((self.path / "environment.json").read_bytes())
+        except (OSError, ValueError):
+            return False
+        return isinstance(facts, dict) and facts.get("program") == "switchmt-snn"
+
+    def require(self) -> RunFolder:
+        """This folder, if it is a run.
+
+        Raises:
+            RunFolderError: it does not exist, or holds something else.
+        """
+        if not self.path.exists():
+            raise RunFolderError(f"no run folder {self.path}, expected one; run switchmt-snn train --run {self.path}")
+        if not self.is_run:
+            raise RunFolderError(
+                f"{self.path} is not a run of switchmt-snn (no environment.json of ours), expected a run folder; "
+                "name another folder"
+            )
+        return self
+
+    def config(self) -> ExperimentConfig:
+        """The run's resolved config."""
+        path = self.path / "config.yaml"
+        if not path.is_file():
+            raise RunFolderError(f"{path} is missing, expected the run's config; the run folder is damaged")
+        return load_config(path)
+
+    def checkpoints(self, keep: int = 2) -> CheckpointStore:
+        """The run's checkpoints."""
+        return CheckpointStore(self.path / "checkpoints", keep)
+
+    def create(self, config: ExperimentConfig, environment: dict[str, Any]) -> None:
+        """Make the folder of a new run.
+
+        Raises:
+            RunFolderError: the folder holds other files, or cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            strangers = [entry.name for entry in self.path.iterdir() if entry.name not in ("run.lock",)]
+            if strangers:
+                raise RunFolderError(
+                    f"{self.path} holds {sorted(strangers)[0]!r} but no run, expected an empty or new folder; "
+                    "name another one with --run"
+                )
+            (self.path / "checkpoints").mkdir()
+            (self.path / "evaluations").mkdir()
+            write_atomically(self.path / "config.yaml", to_yaml(config).encode())
+            # Last: a folder is a run once this file says so.
+            write_atomically(self.path / "environment.json", json.dumps(environment, indent=1).encode())
+        except OSError as error:
+            raise RunFolderError(_unwritable(self.path, error)) from error
+
+    def save_config(self, config: ExperimentConfig) -> None:
+        """Replace the stored config (a raised step budget)."""
+        write_atomically(self.path / "config.yaml", to_yaml(config).encode())
+
+    def lock(self) -> filelock.BaseFileLock:
+        """Take the run for this process.
+
+        Raises:
+            RunFolderError: another process has it, or the folder cannot be written.
+        """
+        lock = filelock.FileLock(self.path / "run.lock")
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock.acquire(timeout=0)
+        except filelock.Timeout as error:
+            raise RunFolderError(
+                f"{self.path} is in use by another process, expected a free run folder; wait for it, or name another "
+                "one with --run"
+            ) from error
+        except OSError as error:
+            raise RunFolderError(_unwritable(self.path, error)) from error
+        return lock
+
+    def save_evaluation(self, evaluation: Evaluation) -> Path:
+        """Write a summary (JSON) and the episodes (CSV) of an evaluation; returns the CSV's path."""
+        folder = self.path / "evaluations"
+        protocol = evaluation.protocol
+        tasks = {row.task for row in evaluation.tasks}
+        stem = f"{_evaluation_stem(evaluation.step)}_{'+'.join(sorted(tasks))}_n{protocol.episodes}_seed{protocol.seed}"
+        rows = [asdict(episode) for episode in evaluation.episodes]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        try:
+            folder.mkdir(exist_ok=True)
+            write_atomically(folder / f"{stem}.csv", text.getvalue().encode())
+            write_atomically(folder / f"{stem}.json", json.dumps(evaluation.to_dict(), indent=1).encode())
+        except OSError as error:
+            raise RunFolderError(_unwritable(folder, error)) from error
+        return folder / f"{stem}.csv"
+
+    def has_evaluation(self, step: int) -> bool:
+        """Whether the weights of this step were evaluated."""
+        return any((self.path / "evaluations").glob(f"{_evaluation_stem(step)}_*.json"))
+
+    def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
+        """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""
+        by_task: dict[str, list[float]] = {}
+        with (self.path / "episodes.csv").open(newline="") as stream:
+            for row in csv.DictReader(stream):
+                by_task.setdefault(row["task"], []).append(float(row["return"]))
+        return {task: (values[:episodes], values[-episodes:]) for task, values in by_task.items()}
+
+
+class RunLogs:
+    """episodes.csv, switches.csv and metrics.jsonl of a running training: the truth that everything else shows."""
+
+    def __init__(self, folder: RunFolder, task_names: tuple[str, ...], sizes: dict[str, int] | None) -> None:
+        """Open the logs; ``sizes`` cuts them back to a checkpoint's moment, None begins them."""
+        self._tasks = task_names
+        self._started = time.monotonic()
+        self._files: dict[str, IO[str]] = {}
+        headers = {"episodes.csv": EPISODE_COLUMNS, "switches.csv": SWITCH_COLUMNS, "metrics.jsonl": ()}
+        for name, columns in headers.items():
+            stream = (folder.path / name).open("a", encoding="utf-8", newline="")
+            stream.truncate(sizes[name] if sizes else 0)
+            self._files[name] = stream
+            if columns and not sizes:
+                stream.write(",".join(columns) + "\n")
+
+    def __call__(self, event: Event) -> None:
+        """Write an event down."""
+        wall_s = round(time.monotonic() - self._started, 3)
+        if isinstance(event, EpisodeEnded):
+            row: Iterable[Any] = (
+                event.step,
+                self._tasks[event.task],
+                event.episode,
+                f"{event.episode_return:g}",
+                event.length_steps,
+                int(event.truncated),
+                f"{event.epsilon:.6g}",
+                event.updates,
+                wall_s,
+            )
+            self._row("episodes.csv", row)
+        elif isinstance(event, SwitchDecided):
+            self._row("switches.csv", self._switch_row(event))
+        elif isinstance(event, Measured):
+            record = {
+                "step": event.step,
+                "task": self._tasks[event.task],
+                "updates": event.updates,
+                "loss": event.loss,
+                "q": event.q,
+                "steps_by_task": dict(zip(self._tasks, event.steps_by_task, strict=True)),
+                "layers": {name: asdict(health) for name, health in event.layers.items()},
+                "wall_s": wall_s,
+            }
+            self._files["metrics.jsonl"].write(json.dumps(record) + "\n")
+
+    def _switch_row(self, event: SwitchDecided) -> list[Any]:
+        decision = event.decision
+        switching = isinstance(decision, SwitchTo)
+        known: dict[str, Any] = {
+            "step": event.step,
+            "visit": event.visit,
+            "task": self._tasks[event.task],
+            "episodes_in_visit": event.episodes_in_visit,
+            "steps_in_visit": event.steps_in_visit,
+            "decision": "switch" if switching else "stay",
+            "next_task": self._tasks[decision.task] if isinstance(decision, SwitchTo) else "",
+            "reason": decision.reason,
+        }
+        numbers = {name: f"{value:.9g}" for name, value in decision.measured.items() if name not in known}
+        return [{**known, **numbers}.get(column, "") for column in SWITCH_COLUMNS]
+
+    def _row(self, name: str, values: Iterable[Any]) -> None:
+        self._files[name].write(",".join(str(value) for value in values) + "\n")
+
+    def sync(self) -> dict[str, int]:
+        """Bring everything to the disk; returns the size of each file."""
+        sizes = {}
+        for name, stream in self._files.items():
+            stream.flush()
+            os.fsync(stream.fileno())
+            sizes[name] = stream.tell()
+        return sizes
+
+    def close(self) -> None:
+        """Close the files."""
+        for stream in self._files.values():
+            stream.close()
+
+
+def describe_environment(config: ExperimentConfig, device: torch.device) -> dict[str, Any]:
+    """Facts that a reader of the run's numbers needs: versions, machine, device, ROM checksums, command."""
+    versions: dict[str, str | None] = {}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return {
+        "program": "switchmt-snn",
+        "command": command_line(),
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "torch_threads": torch.get_num_threads(),
+        "device": str(device),
+        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
+        "versions": versions,
+        "rom_sha256": _rom_sums(config),
+    }
+
+
+def _evaluation_stem(step: int) -> str:
+    return f"step-{step:012d}"
+
+
+def command_line() -> str:
+    """The command line without the folder in which the program lies; ``python`` for a library call."""
+    program = Path(sys.argv[0]).name
+    ours = program in ("switchmt-snn", "__main__.py")
+    return shlex.join(["switchmt-snn", *sys.argv[1:]]) if ours else f"python {program}"
+
+
+def processor() -> str:
+    """The processor's name, as the system tells it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor()
+
+
+def _rom_sums(config: ExperimentConfig) -> dict[str, str]:
+    if config.tasks.suite != "atari":
+        return {}
+    from ale_py import roms
+
+    return {name: hashlib.sha256(Path(roms.get_rom_path(name)).read_bytes()).hexdigest() for name in config.tasks.names}
+
+
+def _unwritable(path: Path, error: OSError) -> str:
+    return f"{path} cannot be written ({error.strerror or error}), expected a writable folder; name another with --run"
+
+
+def check_same_config(stored: ExperimentConfig, asked: ExperimentConfig, path: Path) -> None:
+    """Allow only a raised step budget between a run's config and the one asked for.
+
+    Raises:
+        ConfigError: naming the fields that differ.
+    """
+    changed = differences(stored, asked)
+    raised = changed.pop("total_steps", None)
+    if raised is not None and raised[1] < raised[0]:
+        changed["total_steps"] = raised
+    if changed:
+        shown = ", ".join(f"{key} ({old!r} -> {new!r})" for key, (old, new) in sorted(changed.items()))
+        raise ConfigError(
+            f"{path} holds a run of another config: {shown}; expected the same config (total_steps may be raised); "
+            "name another folder with --run, or continue it with: switchmt-snn train --run " + str(path)
+        )

@@ -1,0 +1,342 @@
+"""Driving a run: new or continued, checkpoints, evaluations, clean stops; for the command line and the library."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
+from switchmt_snn.config import ExperimentConfig, from_dict, load_config, resolve, to_dict
+from switchmt_snn.errors import TrainingFailed
+from switchmt_snn.learning.events import Event, Stepped
+from switchmt_snn.learning.training import Training, make_learner, observation_spec
+from switchmt_snn.machine.devices import keep_freed_memory, select_device
+from switchmt_snn.replay.ring import Batch
+from switchmt_snn.runs.description import describe_method
+from switchmt_snn.runs.folder import (
+    RunFolder,
+    RunLogs,
+    check_same_config,
+    describe_environment,
+    latest_run,
+    new_run_path,
+)
+from switchmt_snn.runs.memory import require_gpu_memory, require_memory
+from switchmt_snn.spiking.network import build_network
+from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.updates.choice import settle
+from switchmt_snn.updates.processes import ProcessGroup, join_processes
+
+BEST_WINDOW_EPISODES = 20
+"""The best checkpoint has the largest mean rise of the newest 20 training returns over a task's first 20."""
+
+
+class Observer(Protocol):
+    """Watches a run; the loop never waits for it to agree."""
+
+    def start(self, training: Training, folder: RunFolder, resumed_at: int | None) -> None:
+        """The run begins or goes on."""
+
+    def __call__(self, event: Event) -> None:
+        """Something happened."""
+
+    def note(self, text: str) -> None:
+        """Something that the user should read."""
+
+    def stop(self) -> None:
+        """The loop is over."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a call of :func:`train` ended.
+
+    Attributes:
+        status: ``finished``, ``stopped`` (by a signal; the same command continues), ``already_finished``, or ``served``
+            (one of the other processes of ``torchrun``).
+        evaluation: the final evaluation of a run that finished.
+    """
+
+    path: Path
+    status: str
+    step: int
+    evaluation: Evaluation | None
+
+
+def train(
+    config: ExperimentConfig | str | Path | None = None,
+    run: str | Path | None = None,
+    observers: Sequence[Observer] = (),
+) -> RunResult:
+    """Train, or continue a run.
+
+    Args:
+        config: a config, a YAML file, or a preset's name. None continues ``run`` with its stored config, or takes the
+            quickstart preset for a new run.
+        run: run folder. One that holds a run of the same config is continued; None makes a new one under ``runs/``.
+        observers: progress displays and the like.
+
+    Under ``torchrun`` the first process does all this, and every update is divided among all processes.
+
+    Raises:
+        SwitchMTError: wrong use (``exit_code`` 2), or a run that failed (``exit_code`` 1).
+    """
+    group = join_processes()
+    try:
+        return _serve(group) if group is not None and group.rank > 0 else _train(config, run, observers, group)
+    finally:
+        if group is not None:
+            group.leave()
+
+
+def _train(
+    config: ExperimentConfig | str | Path | None,
+    run: str | Path | None,
+    observers: Sequence[Observer],
+    group: ProcessGroup | None,
+) -> RunResult:
+    if isinstance(config, (str, Path)):
+        config = load_config(config)
+    folder = RunFolder(Path(run) if run is not None else Path(new_run_path(_name_of(config))))
+    stored = folder.config() if folder.is_run else None
+    if config is None:
+        config = stored or load_config("quickstart")
+    device = select_device(config.device) if group is None else group.device(config.device)
+    processes = 1 if group is None else group.size
+    config, notes = settle(resolve(config), stored, device, processes)
+    if stored is not None:
+        check_same_config(settle(stored, stored, device)[0], config, folder.path)
+    suite = make_suite(config.tasks)
+    torch.backends.cudnn.deterministic = True  # exact resume; benchmark mode would choose kernels by the clock
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    keep_freed_memory()
+    require_memory(describe_method(config, suite).memory, config)
+    require_gpu_memory(config, suite)
+    lock = folder.lock()
+    try:
+        if stored is None:
+            folder.create(config, describe_environment(config, device))
+        elif stored != config:
+            folder.save_config(config)
+        if group is not None:
+            group.share(to_dict(config))
+        training = Training(config, suite, device, group)
+        try:
+            return _Driver(folder, training, observers, notes).run()
+        finally:
+            training.close()
+    finally:
+        lock.release()
+
+
+def _serve(group: ProcessGroup) -> RunResult:
+    """The other processes of ``torchrun``: a learner that takes its part in every update."""
+    config = from_dict(group.share())
+    suite = make_suite(config.tasks)
+    learner = make_learner(config, suite, group.device(config.device), group)
+    size = config.learning.batch_size // group.size
+    observations = np.zeros((size, *suite.observation_shape), suite.frame_dtype)
+    numbers = np.zeros(size, np.int64)
+    learner.serve(Batch(observations, numbers, numbers.astype(np.float32), observations, numbers.astype(np.bool_)))
+    return RunResult(Path(), "served", learner.updates, None)
+
+
+def _name_of(config: ExperimentConfig | None) -> str:
+    return config.name if config is not None else "quickstart"
+
+
+class _Driver:
+    """One call's worth of a run: feeds observers, saves, evaluates, stops."""
+
+    def __init__(
+        self, folder: RunFolder, training: Training, observers: Sequence[Observer], notes: Sequence[str]
+    ) -> None:
+        self.notes = notes
+        self.folder, self.training, self.observers = folder, training, observers
+        self.config = training.config
+        self.store = folder.checkpoints(self.config.recording.keep_checkpoints)
+        self.logs: RunLogs | None = None
+
+    def run(self) -> RunResult:
+        """Continue or begin, to the budget or to a stop."""
+        training, config = self.training, self.config
+        log_sizes, resumed_at, notes = self._restore()
+        finished = resumed_at is not None and training.steps >= config.total_steps
+        if finished and self.folder.has_evaluation(training.steps):
+            return RunResult(self.folder.path, "already_finished", training.steps, None)
+        try:
+            return self._run(log_sizes, resumed_at, [*self.notes, *notes])
+        except OSError as error:
+            raise TrainingFailed(
+                f"writing to {self.folder.path} failed at step {training.steps} ({error.strerror or error}), expected "
+                "a disk with room; the last whole checkpoint is kept: make room and run the same command with "
+                f"--run {self.folder.path}"
+            ) from error
+
+    def _run(self, log_sizes: dict[str, int] | None, resumed_at: int | None, notes: list[str]) -> RunResult:
+        training, path = self.training, self.folder.path
+        self.logs = logs = RunLogs(self.folder, training.suite.names, log_sizes)
+        for observer in self.observers:
+            observer.start(training, self.folder, resumed_at)
+        for text in notes:
+            self._note(text)
+        stopped = False
+        try:
+            with _stop_requests() as requested:
+                for event in training.events():
+                    logs(event)
+                    for observer in self.observers:
+                        observer(event)
+                    if isinstance(event, Stepped):
+                        self._record(event.step)
+                        if requested():
+                            stopped = training.steps < self.config.total_steps
+                            break
+                self._save()
+        finally:
+            logs.close()
+            for observer in self.observers:
+                observer.stop()
+        if stopped:
+            return RunResult(path, "stopped", training.steps, None)
+        return RunResult(path, "finished", training.steps, self._evaluate())
+
+    def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
+        """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""
+        if not self.store.paths():
+            return None, None, []
+        loaded = self.store.load(self.training.replays)
+        self.training.load_state_dict(loaded.state)
+        notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]
+        if not self.training.reproducible:
+            notes.append(
+                "the environment did not repeat its running episodes from seed and actions; the run goes on, but not "
+                "exactly as it would have without the interruption"
+            )
+        return loaded.log_sizes, loaded.step, notes
+
+    def _record(self, step: int) -> None:
+        """Save and evaluate when a border of their periods was crossed by the last vector step."""
+        before = step - self.training.num_envs
+        every = self.config.evaluation.every_steps
+        if every is not None and step // every > before // every and step < self.config.total_steps:
+            self._evaluate()
+        every = self.config.recording.checkpoint_every_steps
+        if step // every > before // every and step < self.config.total_steps:
+            self._save()
+
+    def _save(self) -> None:
+        assert self.logs is not None
+        training = self.training
+        training.check_finite()
+        self.store.save(training.steps, training.state_dict(), training.replays, self.logs.sync())
+        score = self._rise()
+        best = self.store.best_score()
+        if score is not None and (best is None or score > best):
+            self.store.save_best(training.steps, training.learner.network.state_dict(), score)
+
+    def _rise(self) -> float | None:
+        """Mean over tasks of (newest returns - first returns) / spread of the first; None while episodes are few."""
+        returns = self.folder.initial_and_recent_returns(BEST_WINDOW_EPISODES)
+        rises = []
+        for name in self.training.suite.names:
+            first, newest = returns.get(name, ([], []))
+            if len(first) < BEST_WINDOW_EPISODES:
+                return None
+            rises.append((np.mean(newest) - np.mean(first)) / max(1.0, float(np.std(first))))
+        return float(np.mean(rises))
+
+    def _evaluate(self) -> Evaluation:
+        training = self.training
+        agent = Agent(training.learner.network, training.suite, self.config, training.learner.device, training.steps)
+        protocol = EvaluationProtocol.of(self.config.evaluation, self.config.tasks)
+        self._note(f"evaluating: {protocol}")
+        evaluation = evaluate_agent(agent, protocol)
+        self.folder.save_evaluation(evaluation)
+        return evaluation
+
+    def _note(self, text: str) -> None:
+        for observer in self.observers:
+            observer.note(text)
+
+
+@contextmanager
+def _stop_requests() -> Iterator[Callable[[], bool]]:
+    """Within it, the first SIGINT or SIGTERM only asks to stop at the next whole step; a second SIGINT interrupts."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def load_agent(run: str | Path | None = None, checkpoint: str = "last", device: str = "auto") -> Agent:
+    """The trained agent of a run.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        checkpoint: ``last`` or ``best``.
+        device: as in the config.
+
+    Raises:
+        RunFolderError: no such run.
+        CheckpointError: no whole checkpoint.
+    """
+    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    config = folder.config()
+    suite = make_suite(config.tasks)
+    step, weights, _ = folder.checkpoints().load_model(checkpoint)
+    network = build_network(config.network, observation_spec(suite), config.seed)
+    network.load_state_dict(weights)
+    return Agent(network, suite, config, select_device(device), step)
+
+
+def evaluate(
+    run: str | Path | None = None,
+    task: str | None = None,
+    checkpoint: str = "last",
+    save: bool = True,
+    **protocol: Any,
+) -> Evaluation:
+    """Evaluate a run's agent and the random policy.
+
+    Args:
+        run: run folder; None takes the newest under ``runs/``.
+        task: one task's name; None evaluates all.
+        checkpoint: ``last`` or ``best``.
+        save: write JSON and CSV to the run's ``evaluations/``.
+        protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.
+
+    Raises:
+        SwitchMTError: no run, no checkpoint, no such task, or a protocol out of range.
+    """
+    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    agent = load_agent(folder.path, checkpoint)
+    settings = replace(agent.config.evaluation, **protocol)
+    tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
+    evaluation = evaluate_agent(agent, EvaluationProtocol.of(settings, agent.config.tasks), tasks)
+    if save:
+        folder.save_evaluation(evaluation)
+    return evaluation

@@ -1,0 +1,1 @@
+"""How an update is executed: eager, compiled, native, as a CUDA graph, by several processes."""

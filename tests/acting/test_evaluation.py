@@ -1,0 +1,128 @@
+"""Evaluation: the protocol's episodes, determinism, and numbers by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from switchmt_snn.acting import evaluation
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.acting.evaluation import (
+    EpisodeScore,
+    EvaluationProtocol,
+    evaluate_agent,
+    play_episodes,
+    summarize,
+)
+from switchmt_snn.config import EvaluationConfig, TasksConfig
+from switchmt_snn.errors import TaskError
+from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.spiking.network import build_network
+from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.suite import Reference
+from switchmt_snn.viewing.tables import published_rows
+from tests.conftest import CountingEnvironment, small_config, vector_suite
+
+PROTOCOL = EvaluationProtocol.of(EvaluationConfig(episodes=7, num_envs=3), TasksConfig(suite="minatar"))
+
+
+def minatar_agent(**network: str) -> Agent:
+    config = small_config(
+        tasks={"suite": "minatar", "names": ["breakout", "asterix"], "sticky_action_probability": 0.1},
+        network={"trunk": "minatar", "threshold": 0.3, **network},
+    )
+    suite = make_suite(config.tasks)
+    return Agent(build_network(config.network, observation_spec(suite), 3), suite, config, torch.device("cpu"), 12)
+
+
+def test_every_episode_is_played_once_with_its_own_seed() -> None:
+    suite = vector_suite(lambda task, n: CountingEnvironment(task, n, 9), 4)
+    scores = play_episodes("agent", lambda x, task: np.tile([[0.0, 2.0]], (len(x), 1)), suite, 1, range(7), 10_000, 0.0)
+    assert [score.episode for score in scores] == list(range(7))
+    assert len({score.seed for score in scores}) == 7
+    assert all(score.score == 45 and score.length_steps == 9 and score.mean_q == 2.0 for score in scores)
+    assert {score.truncated for score in scores} == {score.seed % 2 == 0 for score in scores}
+
+
+def test_deterministic_for_a_seed() -> None:
+    one, two = (evaluate_agent(minatar_agent(), PROTOCOL) for _ in range(2))
+    assert one == two
+    other = evaluate_agent(minatar_agent(), replace(PROTOCOL, seed=1))
+    assert [e.score for e in other.episodes] != [e.score for e in one.episodes]
+
+
+@pytest.mark.parametrize(("encoding", "engine"), [("direct", "fused"), ("rate", "fused"), ("direct", "snntorch")])
+def test_threads_play_what_one_after_the_other_plays(encoding: str, engine: str, monkeypatch) -> None:
+    """snnTorch's neurons write into themselves and random encodings draw: neither is shared between threads."""
+
+    @contextmanager
+    def one_core() -> Iterator[ThreadPoolExecutor]:
+        with ThreadPoolExecutor(1) as pool:
+            yield pool
+
+    agent = minatar_agent(encoding=encoding, neuron_engine=engine)
+    threads = evaluate_agent(agent, PROTOCOL)
+    monkeypatch.setattr(evaluation, "all_cores", one_core)
+    assert evaluate_agent(agent, PROTOCOL) == threads
+
+
+def test_scores_do_not_depend_on_how_many_play_side_by_side() -> None:
+    """The random policy exactly: an episode is its seed's alone."""
+    agent = minatar_agent()
+    by_width = [
+        [e for e in evaluate_agent(agent, replace(PROTOCOL, num_envs=n)).episodes if e.policy == "random"]
+        for n in (1, 7)
+    ]
+    assert by_width[0] == by_width[1]
+
+
+def test_summary_by_hand() -> None:
+    suite = vector_suite(lambda task, n: CountingEnvironment(task, n, 9), 4)
+    suite = replace(suite, references={"a": Reference(random=1.0, human=11.0, source="hand")})
+    episodes = [
+        EpisodeScore("agent", "a", i, i, score, length, q, False)
+        for i, (score, length, q) in enumerate([(2.0, 10, 0.5), (4.0, 20, 1.5), (9.0, 30, 1.0)])
+    ]
+    row = summarize(suite, episodes)
+    assert (row.mean, row.median, row.mean_length_steps, row.mean_q) == (5.0, 4.0, 20.0, 1.0)
+    assert row.standard_error == pytest.approx(math.sqrt(13) / math.sqrt(3))  # variance (9 + 1 + 16) / 2
+    assert row.human_normalized == pytest.approx(0.4)
+
+
+def test_one_task_and_unknown_tasks() -> None:
+    agent = minatar_agent()
+    assert {e.task for e in evaluate_agent(agent, PROTOCOL, ("asterix",)).episodes} == {"asterix"}
+    with pytest.raises(TaskError, match="did you mean 'asterix'"):
+        evaluate_agent(agent, PROTOCOL, ("astrix",))
+
+
+def test_agent_acts_on_one_observation_and_on_batches() -> None:
+    agent = minatar_agent()
+    batch = np.random.default_rng(0).integers(0, 2, (5, *agent.suite.observation_shape)).astype(np.uint8)
+    actions = agent.act(batch, "asterix")
+    assert actions.shape == (5,)
+    assert isinstance(agent.act(batch[0], "asterix"), int)
+    assert agent.q_values(batch[0], 1).shape == (6,)
+    with pytest.raises(TaskError, match="has shape"):
+        agent.act(batch[0, 0], "asterix")
+
+
+def test_protocol_is_said_in_words() -> None:
+    text = str(EvaluationProtocol.of(EvaluationConfig(), TasksConfig()))
+    for part in ("30 episodes", "epsilon 0.05", "raw return", "seed", "sticky actions 0", "fire on reset", "108,000"):
+        assert part in text
+
+
+def test_published_rows_are_the_papers() -> None:
+    rows = {(policy, task): mean for policy, task, mean in published_rows(["pong", "breakout", "enduro"])}
+    assert rows["SwitchMT (paper)", "breakout"] == 5.6
+    assert rows["MTSpark_ADD (paper)", "enduro"] == 371.2
+    assert rows["human (Wang 2016)", "pong"] == 14.6
+    assert rows["random (Wang 2016)", "pong"] == -20.7

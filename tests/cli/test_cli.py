@@ -1,0 +1,263 @@
+"""The command line as a user meets it, on real Atari games."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from switchmt_snn.cli import main
+from switchmt_snn.config import METHODS, POLICIES, ExperimentConfig
+from switchmt_snn.config.yaml_io import field_documentation
+from tests.spiking.test_network import TABLE_3
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "--total-steps", "240", "--threads", "1", "--tasks.num-envs", "2", "--learning.learning-starts-steps", "32",
+    "--learning.batch-size", "4", "--learning.replay-capacity-steps", "400", "--switching.max-stay-steps", "60",
+    "--learning.update-every-steps", "16", "--tasks.max-episode-frames", "120", "--evaluation.episodes", "1",
+    "--recording.metrics-every-steps", "80", "--recording.checkpoint-every-steps", "100",
+]  # fmt: skip
+
+
+def call(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """A command in this process: exit code, stdout, stderr."""
+    with pytest.raises(SystemExit) as stop:
+        main(list(words))
+    out = capsys.readouterr()
+    return int(stop.value.code or 0), out.out, out.err
+
+
+def test_describe_gives_the_seven_counts(capsys) -> None:
+    code, out, _ = call(capsys, "describe", "--json")
+    assert code == 0
+    methods = json.loads(out)["methods"]
+    assert {name: facts["trainable_parameters"] for name, facts in methods.items()} == TABLE_3
+    conv1, conv2 = methods["SwitchMT"]["layers"][:2]
+    assert conv1["operations_per_step"] == 32 * 20 * 20 * 4 * 8 * 8
+    assert (conv1["steps"], conv2["steps"]) == (1, 4)
+    assert methods["SwitchMT"]["neurons"] == 12_800 + 5_184 + 3_136 + 2 * 512
+    for facts in methods.values():
+        assert sum(layer["parameters"] for layer in facts["layers"]) == facts["trainable_parameters"]
+
+
+def test_describe_shows_the_configs_own_network(capsys) -> None:
+    """An ablation is described as it is, and every method under settings that only some can have."""
+    _, out, _ = call(capsys, "describe", "--network.dendrites", "none", "--json")
+    assert json.loads(out)["methods"]["SwitchMT"]["trainable_parameters"] == TABLE_3["DSQN_D"]
+    flags = ["--network.dendrites", "per_neuron", "--network.encoding", "rate", "--network.k-winners", "50"]
+    code, out, err = call(capsys, "describe", *flags, "--json")
+    assert code == 0, err
+    counts = {name: facts["trainable_parameters"] for name, facts in json.loads(out)["methods"].items()}
+    assert counts["SwitchMT"] == TABLE_3["DSQN_D"] + 2 * 512 * 9
+    assert counts["DQN"] == TABLE_3["DQN"]
+
+
+def test_describe_table_names_every_method(capsys) -> None:
+    _, out, _ = call(capsys, "describe", "minatar")
+    for method in METHODS:
+        assert method in out
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_trains_on_atari(method: str, tmp_path: Path, capsys) -> None:
+    run = tmp_path / "run"
+    code, out, err = call(capsys, "train", "--run", str(run), "--network.method", method, *SMALL)
+    assert code == 0, err
+    assert "Scores at step 240" in out
+    assert "SwitchMT (paper)" in out
+    assert "too short to learn Atari" in out
+    assert out.rstrip().endswith(str(run))
+    tasks = [
+        row["task"]
+        for row in csv.DictReader((run / "switches.csv").read_text().splitlines())
+        if row["decision"] == "switch"
+    ]
+    assert tasks[:3] == ["pong", "breakout", "enduro"]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path: Path, capsys) -> None:
+    run = tmp_path / "run"
+    flags = [
+        *SMALL,
+        "--switching.policy",
+        policy,
+        "--switching.window-episodes",
+        "1",
+        "--tasks.names",
+        "pong",
+        "breakout",
+    ]
+    flags += ["--switching.plateau-window-episodes", "3", "--switching.visit-episodes", "2"]
+    flags += ["--switching.visit-steps", "50", "--switching.max-stay-steps", "200"]
+    code, _, err = call(capsys, "train", "--run", str(run), *flags)
+    assert code == 0, err
+    rows = list(csv.DictReader((run / "switches.csv").read_text().splitlines()))
+    assert rows
+    numbers = {
+        "fixed_episodes": ["visit_episodes"],
+        "fixed_steps": ["visit_steps"],
+        "interleave": [],
+        "parameter_change": ["parameter_change", "change_threshold"],
+        "parameter_change_per_update": ["parameter_change", "updates_in_window"],
+        "reward_plateau": ["reward_slope", "reward_t", "flat_episodes"],
+        "parameter_and_reward": ["parameter_change", "reward_slope", "parameter_says_leave"],
+    }
+    assert any(all(row[column] for column in numbers[policy]) for row in rows), rows
+
+
+def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = call(capsys, "train", "--json", *SMALL)
+    assert code == 0
+    trained = json.loads(out)
+    assert trained["status"] == "finished"
+    code, out, _ = call(capsys, "evaluate", "--episodes", "2", "--task", "pong", "--json")
+    assert code == 0
+    result = json.loads(out)
+    assert result["run"] == trained["run"]
+    assert {row["task"] for row in result["tasks"]} == {"pong"}
+    files = {path.suffix for path in (tmp_path / trained["run"] / "evaluations").iterdir()}
+    assert files == {".csv", ".json"}
+    code, _, err = call(capsys, "evaluate", "--episodes", "0")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "evaluation.episodes is 0, expected at least 1" in err
+    code, _, err = call(capsys, "evaluate", "--task", "pog")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "did you mean 'pong'" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["trian"], "unknown command 'trian'; did you mean 'train'?"),
+        (["train", "nothing.yaml"], "no config file or preset 'nothing.yaml'"),
+        (["train", "--learning.batchsize", "3"], "--learning.batch-size"),
+        (["train", "--learning.batch-size", "many"], "invalid literal for int"),
+        (["train", "--network.timesteps", "0"], "network.timesteps is 0, expected at least 1"),
+        (["train", "--total-steps", "-1"], "total_steps is -1, expected at least 1"),
+        (["train", "--tasks.names", "pongg"], "did you mean 'pong'"),
+        (["train", "--tasks.suite", "gym", "--tasks.names", "Pendulum-v1"], "expected Discrete"),
+        (["train", "--learning.replay-capacity-steps", "999999999"], "lower learning.replay_capacity_steps to at most"),
+        (["train", "--network.method", "best"], "invalid choice 'best'"),
+        (["evaluate"], "expected one; run switchmt-snn train"),
+        (["describe", "--network.trunk", "minatar", "--tasks.names", "nope"], "unknown Atari game"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exit_2(words: list[str], message: str, capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = call(capsys, *words)
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert message in err
+    assert list(tmp_path.iterdir()) == [], "a refused command leaves nothing behind"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there(capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, err = call(capsys, "train", "--device", "cuda")
+    assert code == 2
+    assert "device is 'cuda', expected one that this machine has" in err
+
+
+def test_print_config_is_the_resolved_config(capsys) -> None:
+    code, out, _ = call(capsys, "train", "paper", "--print-config", "--seed", "5")
+    assert code == 0
+    data = yaml.safe_load(out)
+    assert data["seed"] == 5
+    assert data["switching"]["policy"] == "parameter_change"
+    assert data["network"]["trunk"] == "nature"
+
+
+def test_command_line_surface_is_frozen(capsys) -> None:
+    """Every config field is a flag of train and describe; the commands' own flags are these."""
+    for command, own in (("train", {"--run", "--print-config", "--json"}), ("describe", {"--json"})):
+        _, out, _ = call(capsys, command, "--help")
+        flags = set(re.findall(r"(?<![\w-])--(?!no-)[a-z][\w.-]*", out))
+        fields = {"--" + key.replace("_", "-") for _, _, rows in field_documentation() for key, *_ in rows}
+        assert fields | own <= flags | {"--tasks.fire-on-reset"}, (fields | own) - flags
+    own_flags = {
+        "evaluate": "--episodes --epsilon --seed --num-envs --task --checkpoint --engine --json",
+        "export": "--onnx --nir --task --int8 --nir-profile --parity-decisions --checkpoint --out --json",
+        "profile": "--decisions --target --checkpoint --out --json",
+    }
+    for command, flags_text in own_flags.items():
+        _, out, _ = call(capsys, command, "--help")
+        assert set(flags_text.split()) <= set(re.findall(r"--[a-z][\w-]*", out)), command
+
+
+def test_help_version_doctor(capsys) -> None:
+    assert call(capsys)[0] == 2
+    for words in (["--help"], ["--version"], ["doctor"], ["doctor", "--json"]):
+        code, out, _ = call(capsys, *words)
+        assert code == 0
+        assert out
+
+
+def test_importing_the_package_is_light() -> None:
+    code = (
+        "import sys, switchmt_snn; assert 'torch' not in sys.modules; switchmt_snn.train; assert 'torch' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_readme_library_example_runs(tmp_path: Path, monkeypatch) -> None:
+    """The README's Python block, with fewer steps."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert blocks
+    monkeypatch.chdir(tmp_path)
+    for block in blocks:
+        assert "total_steps" in block
+        short = re.sub(r"total_steps=[\d_]+", "total_steps=2_000", block)
+        exec(compile(short, "README.md", "exec"), {"__name__": "readme"})
+
+
+def test_gym_tasks_from_a_file(tmp_path: Path, capsys) -> None:
+    """Two Gymnasium ids of different shapes and action counts in one spiking network."""
+    path = tmp_path / "two.yaml"
+    path.write_text(
+        "name: two\ntotal_steps: 600\ntasks: {suite: gym, names: [CartPole-v1, Acrobot-v1]}\n"
+        "learning: {batch_size: 8, learning_starts_steps: 50, replay_capacity_steps: 500, update_every_steps: 4}\n"
+        "switching: {max_stay_steps: 150}\nevaluation: {episodes: 1}\n"
+    )
+    code, out, err = call(capsys, "train", str(path), "--run", str(tmp_path / "run"))
+    assert code == 0, err
+    assert "Acrobot-v1" in out
+
+
+def test_best_weights_are_kept_and_can_be_evaluated(tmp_path: Path, capsys) -> None:
+    run = tmp_path / "run"
+    flags = [word if word != "240" else "900" for word in SMALL]
+    flags += ["--tasks.suite", "gym", "--tasks.names", "CartPole-v1"]
+    assert call(capsys, "train", "--run", str(run), *flags)[0] == 0
+    manifest = json.loads((run / "checkpoints" / "best" / "manifest.json").read_text())
+    code, out, _ = call(capsys, "evaluate", str(run), "--checkpoint", "best", "--episodes", "2", "--json")
+    assert code == 0
+    assert json.loads(out)["step"] == manifest["step"]
+
+
+def test_tensorboard_is_one_more_view(tmp_path: Path, capsys) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = tmp_path / "run"
+    flags = ["--tasks.suite", "gym", "--tasks.names", "CartPole-v1", "--recording.tensorboard"]
+    code, _, err = call(capsys, "train", "--run", str(run), *SMALL, *flags)
+    assert code == 0, err
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    returns = [(point.step, point.value) for point in events.Scalars("return/CartPole-v1")]
+    rows = list(csv.DictReader((run / "episodes.csv").read_text().splitlines()))
+    assert returns == [(int(row["step"]), float(row["return"])) for row in rows]
+
+
+def test_default_config_has_no_private_fields() -> None:
+    assert all(not name.startswith("_") for name in vars(ExperimentConfig()))

@@ -1,0 +1,84 @@
+"""The programs of docs/deploy.md, run as they stand there."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from switchmt_snn.export.folding import fold
+from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
+from switchmt_snn.export.formats.onnx_writer import decision_model
+from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations
+from switchmt_snn.export.runtimes.agents import encode
+from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
+from switchmt_snn.export.runtimes.simulators import SIMULATORS
+from switchmt_snn.runs.files import write_atomically
+from tests.export.export_cases import make_agent, observations
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "deploy.md"
+
+
+def programs() -> dict[str, str]:
+    """The document's programs by file name (their first line says it)."""
+    blocks = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.S)
+    return {re.match(r'"""python (\S+)', block).group(1): block for block in blocks}
+
+
+def test_a_host_without_torch_and_without_this_package_plays_pong(tmp_path: Path) -> None:
+    agent = make_agent(tasks={"suite": "atari", "names": ["breakout", "pong"]}, trunk="nature")
+    write_atomically(tmp_path / "decision.onnx", decision_model(fold(agent)).SerializeToString())
+    program = programs()["play.py"]
+    assert len(program.splitlines()) <= 30
+    (tmp_path / "play.py").write_text(program)
+    blocked = "import sys, runpy; sys.modules.update(torch=None, switchmt_snn=None); sys.argv = sys.argv[1:]; "
+    code = blocked + "runpy.run_path(sys.argv[0], run_name='__main__')"
+    command = [sys.executable, "-c", code, "play.py", "decision.onnx", "60"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    spikes = re.fullmatch(r"score -?\d+ after 60 decisions, (\d+) spikes per decision\n", done.stdout)
+    assert spikes, done.stdout
+    assert int(spikes.group(1)) > 0
+
+
+def test_the_host_sees_what_the_agent_saw_in_training() -> None:
+    """Observations of the host's environment equal those of this package's tasks, so the scores mean the same."""
+    from ale_py.vector_env import AtariVectorEnv
+
+    from switchmt_snn.tasks.play import Play
+
+    agent = make_agent(tasks={"suite": "atari", "names": ["pong"]}, trunk="nature")
+    game = AtariVectorEnv("pong", num_envs=1, full_action_space=True, use_fire_reset=True, reward_clipping=False)
+    play = Play(agent.suite, 0, 1)
+    seen, _ = game.reset(seed=1)
+    play.begin(np.array([0]), np.array([1]))
+    for step in range(120):
+        assert np.array_equal(seen, play.observations), step
+        action = np.array([step % 18])
+        seen, reward, *_ = game.step(action)
+        assert reward[0] == play.step(action).rewards[0]
+    play.close()
+    game.close()
+
+
+@pytest.mark.parametrize("name", ["norse", "spikingjelly", "sinabs"])
+def test_programs_for_other_simulators(name: str, tmp_path: Path) -> None:
+    simulator = SIMULATORS[name]
+    if not simulator.installed:
+        pytest.skip(f"{name} is not installed")
+    agent = dyadic_copy(make_agent(seed=2))
+    graph = nir_graph(fold(agent), 1)
+    write_nir(graph, tmp_path / "asterix.nir")
+    x = dyadic_observations(observations(agent, 1, seed=3))
+    np.save(tmp_path / "observation.npy", x[0])
+    (tmp_path / "program.py").write_text(programs()[f"{name}_q.py"])
+    command = [sys.executable, "program.py", "asterix.nir", "observation.npy"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    expected, _ = NirInterpreter(graph, **simulator.interpreter).run(encode(agent.suite, agent.config, x, 0))
+    assert json.loads(done.stdout.splitlines()[-1]) == expected.mean(0)[0].tolist()

@@ -1,0 +1,165 @@
+"""The report: self-contained, every number from profile.json, nothing cut in a browser of either width."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from switchmt_snn.export import profile
+from switchmt_snn.export.report.page import FILTERS, render_report
+from tests.export.test_export_command import call, run, trained  # noqa: F401
+
+TEMPLATE = Path(__file__).parents[2] / "export" / "report" / "templates" / "report.html.jinja"
+NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]\d+)?%?")
+VOID = {"meta", "link", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Visible text, addresses, and whether every element is closed."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.text += [value or "" for name, value in attrs if name in ("title", "alt")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag, f"{tag} closes another element"
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != "style":
+            self.text.append(data)
+
+
+def leaves(value: Any) -> Iterator[Any]:
+    """All keys and plain values."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield key
+            yield from leaves(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from leaves(inner)
+    else:
+        yield value
+
+
+def numbers_that_may_stand(facts: Any) -> set[str]:
+    """The numbers of profile.json in every format of the report, those in its texts, and those of the prose."""
+    allowed: set[str] = set()
+    for leaf in leaves(facts):
+        if isinstance(leaf, str):
+            allowed |= set(NUMBER.findall(leaf))
+        elif leaf is not None and not isinstance(leaf, bool):
+            allowed |= {text for show in FILTERS.values() for text in NUMBER.findall(show(leaf))} | {str(leaf)}
+    prose = re.sub(r"<style>.*?</style>|\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}|<[^>]*>", " ", TEMPLATE.read_text(), flags=re.S)
+    return allowed | set(NUMBER.findall(prose))
+
+
+def check(path: Path, facts: Any) -> Page:
+    page = Page(path.read_text())
+    assert page.open == []
+    assert all(address.startswith("data:") for address in page.addresses), "an address outside the page"
+    allowed = numbers_that_may_stand(facts) | {str(sum(1 for _ in facts.get("runs", [1])))}
+    strange = {number for text in page.text for number in NUMBER.findall(text)} - allowed
+    # A list of neurons is told by its length.
+    lengths = {str(len(leaf)) for leaf in all_lists(facts)}
+    assert strange <= lengths, strange - lengths
+    return page
+
+
+def all_lists(value: Any) -> Iterator[list[Any]]:
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if isinstance(value, list):
+        yield value
+    for one in inner:
+        yield from all_lists(one)
+
+
+@pytest.fixture(scope="module")
+def profiled(trained: Path) -> Path:  # noqa: F811
+    return profile(trained, decisions=40).folder
+
+
+def test_every_number_is_in_profile_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    out, _ = call(capsys, "profile", run, "--decisions", 40)
+    folder = run / "profile"
+    facts = json.loads((folder / "profile.json").read_text())
+    page = check(folder / "report.html", facts)
+    text = " ".join(page.text)
+    assert facts["headline"] in text
+    assert facts["headline"] in " ".join(out.split())
+    for task in facts["tasks"]:
+        assert FILTERS["whole"](task["per_decision"]["acs"]) in text
+    frames_and_rasters = [address for address in page.addresses if address.startswith("data:image/png")]
+    samples = [task["sample"] for task in facts["tasks"]]
+    expected = sum(len(s["actions"]) + sum(bool(layer["neurons"]) for layer in s["layers"]) for s in samples)
+    assert len(frames_and_rasters) == expected
+
+
+def test_a_number_that_is_not_in_profile_json_would_be_noticed(profiled: Path, tmp_path: Path) -> None:
+    facts = json.loads((profiled / "profile.json").read_text())
+    page = (profiled / "report.html").read_text()
+    (tmp_path / "changed.html").write_text(page.replace("</article>", "<p>987,654.321</p></article>"))
+    with pytest.raises(AssertionError, match="987,654"):
+        check(tmp_path / "changed.html", facts)
+
+
+def test_several_runs_in_one_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    shutil.rmtree(run / "profile", ignore_errors=True)
+    _, err = call(capsys, "profile", run, tmp_path / "nothing", code=2)
+    assert "no run folder" in err
+    assert not (run / "profile").exists(), "nothing is profiled before all are found"
+    out, _ = call(capsys, "profile", run, run, "--decisions", 20, "--target", "cmos45-int8", "--out", tmp_path)
+    assert "Per decision, smallest to largest" in out
+    facts = json.loads((tmp_path / "comparison.json").read_text())
+    assert len(facts["runs"]) == 2
+    text = " ".join(check(tmp_path / "comparison.html", facts).text)
+    assert "2 runs side by side" in text
+    assert (run / "profile" / "report.html").exists()
+    out, _ = call(capsys, "profile", run, run, "--decisions", 20, "--out", tmp_path, "--json")
+    assert json.loads(out) == json.loads((tmp_path / "comparison.json").read_text())
+
+
+def test_names_are_escaped(profiled: Path) -> None:
+    facts = json.loads((profiled / "profile.json").read_text())
+    facts["run"] = "<script>alert(1)</script>"
+    frames = [np.zeros((8, *(1, 10, 10)), np.uint8) for _ in facts["tasks"]]
+    assert "<script>" not in render_report([facts], [frames], "x")
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_nothing_is_cut_in_a_browser(profiled: Path, width: int) -> None:
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium")
+    outside = """() => [...document.querySelectorAll('body *')].filter(e => {
+        const box = e.getBoundingClientRect();
+        return box.width && (box.left < -1 || box.right > document.documentElement.clientWidth + 1
+            || (e.clientWidth && e.scrollWidth > e.clientWidth + 1)); }).map(e => e.outerHTML.slice(0, 80))"""
+    with playwright.sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": 900})
+        messages: list[str] = []
+        page.on("console", lambda message: messages.append(message.text))
+        page.on("pageerror", lambda error: messages.append(str(error)))
+        page.goto((profiled / "report.html").resolve().as_uri())
+        assert page.evaluate(outside) == []
+        browser.close()
+    assert messages == []

@@ -1,0 +1,106 @@
+"""Gains and heads in C++ against the network's own operations."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import pytest
+import torch
+from torch import Tensor
+
+from switchmt_snn.config import resolve
+from switchmt_snn.native import library as native_library
+from switchmt_snn.native.streams import Gains, Heads
+from switchmt_snn.spiking.network import ObservationSpec, QNetwork, Stream, build_network
+from tests.conftest import small_config
+
+pytestmark = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
+
+
+def network_of(actions: int = 6, **settings: object) -> QNetwork:
+    config = small_config(network={"trunk": "mlp", "hidden_units": 37, **settings})
+    return build_network(resolve(config).network, ObservationSpec((7,), 1, 1.0, True, actions, 3), 1)
+
+
+def streams_of(network: QNetwork) -> list[Stream]:
+    return [cast(Stream, stream) for stream in network.streams.values()]
+
+
+@pytest.mark.parametrize("dendrites", ["shared", "per_neuron"])
+@pytest.mark.parametrize("gating", ["max", "absolute_max"])
+@pytest.mark.parametrize("equal", [False, True])
+def test_gains_are_those_of_the_dendrites(dendrites: str, gating: str, equal: bool) -> None:
+    """With their gradients, also where two segments have the largest response."""
+    streams = streams_of(network_of(dendrites=dendrites, dendritic_gating=gating))
+    for stream in streams:
+        assert stream.dendrites is not None
+        with torch.no_grad():
+            stream.dendrites.segments_NSK.normal_()
+            if equal:
+                stream.dendrites.segments_NSK[:, 1] = stream.dendrites.segments_NSK[:, 2]
+    gains, weights = Gains(streams), torch.randn(74)
+    for task in (0, 2):
+        theirs = torch.cat([cast(torch.nn.Module, stream.dendrites)(task).expand(37) for stream in streams])
+        torch.testing.assert_close(gains.of_task(task), theirs.detach(), rtol=1e-6, atol=1e-7)
+        their_gradients = torch.autograd.grad((theirs * weights).sum(), gains.parameters)
+        assert all(gradient.any() for gradient in their_gradients)
+        for ours, their in zip(gains.gradients(task, weights), their_gradients, strict=True):
+            torch.testing.assert_close(ours, their, rtol=1e-5, atol=1e-6)
+
+
+def test_a_stream_without_dendrites_has_gains_of_one() -> None:
+    gains = Gains(streams_of(network_of(method="DSQN_D")))
+    assert torch.equal(gains.of_task(1), torch.ones(74))
+    assert gains.parameters == ()
+    assert gains.gradients(1, torch.ones(74)) == []
+
+
+@pytest.mark.parametrize("method", ["DSQN", "SwitchMT"])
+@pytest.mark.parametrize(("steps", "batch", "actions"), [(1, 32, 6), (4, 3, 18), (2, 5, 1)])
+def test_heads_are_those_of_the_network(method: str, steps: int, batch: int, actions: int) -> None:
+    network = network_of(actions, method=method)
+    streams, heads = streams_of(network), Heads(network)
+    spikes = (torch.rand(steps, batch, 37 * len(streams)) < 0.4).float()
+    for _ in range(2):  # the second time with other parameters
+        heads.read()
+        x = spikes.clone().requires_grad_()
+        parts = zip(network.streams, streams, x.split(37, dim=-1), strict=True)
+        theirs = network.combine({name: stream.head(part) for name, stream, part in parts})
+        torch.testing.assert_close(heads.outputs(spikes), theirs.detach(), rtol=1e-5, atol=1e-6)
+        weights = torch.randn(theirs.shape)
+        their_gradients = torch.autograd.grad((theirs * weights).sum(), [x, *heads.parameters])
+        ours, of_heads = heads.gradients(spikes, weights, 0.25)
+        for our, their in zip((ours * 4, *of_heads), their_gradients, strict=True):
+            torch.testing.assert_close(our, their, rtol=1e-5, atol=1e-5)
+        with torch.no_grad():
+            for part in heads.parameters:
+                part.normal_()
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    heads, threads = Heads(network_of()), torch.get_num_threads()
+    heads.read()
+    spikes, weights, results = torch.rand(3, 40, 74), torch.randn(3, 40, 6), []
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            ours, of_heads = heads.gradients(spikes, weights, 1.0)
+            results.append((heads.outputs(spikes), ours, *of_heads))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize(
+    "spikes", [torch.zeros(1, 4, 73), torch.zeros(1, 4, 74).double(), torch.zeros(1, 4, 148)[..., ::2]]
+)
+def test_what_cplusplus_would_read_wrongly_is_refused(spikes: Tensor) -> None:
+    heads = Heads(network_of())
+    for action in (lambda: heads.outputs(spikes), lambda: heads.gradients(spikes, torch.zeros(1, 4, 6), 1.0)):
+        with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 74\]"):
+            action()
+    with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 3\]"):
+        Gains(streams_of(network_of().double())).of_task(0)
+    with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 6\]"):
+        heads.gradients(torch.zeros(1, 4, 74), torch.zeros(1, 4, 7), 1.0)
