@@ -132,7 +132,7 @@ def test_every_field_is_documented() -> None:
 
 
 def test_generated_pages_are_up_to_date() -> None:
-    from docs.generate import PAGES
+    from docs.tools.pages import PAGES
 
     for name, page in PAGES.items():
         assert (ROOT / name).read_text() == page(), f"{name} differs; run: python -m docs.generate"
