@@ -25,7 +25,7 @@ from switchmt_snn.export import to_onnx
 from switchmt_snn.export.runtimes.agents import OnnxAgent
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network, trainable_parameters
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 
 BATCHES = (1, 8)
 PLAIN = "plain loop over snn.Leaky"

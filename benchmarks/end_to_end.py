@@ -28,7 +28,7 @@ from switchmt_snn.learning.events import Stepped
 from switchmt_snn.learning.training import Training
 from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.replay.ring import Batch
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 
 GAME = "breakout"
 BATCH, UPDATE_EVERY, WARM_UP, EPSILON = 32, 4, 400, 0.1

@@ -20,8 +20,8 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from benchmarks.measure import environment, rates
 from switchmt_snn.config import load_config, resolve
-from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 COPIES = (1, 4, 16)

@@ -25,8 +25,8 @@ from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 ENVS = 4

@@ -21,8 +21,8 @@ from switchmt_snn.learning.learner import Learner
 from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.replay.ring import Batch, FrameReplay
 from switchmt_snn.spiking.network import ObservationSpec, build_network, trainable_parameters
-from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play
+from switchmt_snn.tasks.registry import make_suite
 
 ACTIONS = 18
 BASE = {"timesteps": 4, "batch_size": 32, "tasks": 3}

@@ -47,7 +47,7 @@ from switchmt_snn.native import library as native_library
 from switchmt_snn.native.products import spikes_as_bits
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 PLAIN = "plain loop over snn.Leaky"

@@ -26,7 +26,7 @@ from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAge
 from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 Note = Callable[[str], None]

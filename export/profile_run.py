@@ -33,9 +33,8 @@ from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.runs.folder import RunFolder, command_line, latest_run
 from switchmt_snn.runs.run import load_agent
+from switchmt_snn.tasks.registry import suite_of
 
-FRAMES_PER_S = 60.0
-"""Of an Atari game; the agent decides at every ``frame_skip``-th."""
 MAX_DECISIONS = 10**7
 KEPT_DECISIONS = 4000
 """Recorded decisions per task that are held and stored; of more, counts are made while they are played."""
@@ -126,8 +125,7 @@ def profile(
     fits = [check_fit(layer_shapes(network), chip).to_dict() for chip in selection.chips]
     bits = sorted({fit["weight_bits"] for fit in fits})
     tasks, frames = [], []
-    rate = agent.config.tasks
-    decisions_per_s = FRAMES_PER_S / rate.frame_skip if rate.suite == "atari" else None
+    decisions_per_s = suite_of(agent.config.tasks).decisions_per_s
     for index, (recording, counted) in enumerate(zip(recordings, profiles, strict=True)):
         sample = take_sample(agent, index, recording)
         frames.append(sample.frames)

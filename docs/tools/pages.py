@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from docs.tools.performance_page import performance_page
+from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import field_documentation, load_config
 from switchmt_snn.export.report.page import microjoule
 
@@ -168,7 +169,8 @@ def minatar_page() -> str:
     facts = {run.name: json.loads((run / "environment.json").read_text()) for run in sorted(folder.glob("*-seed*"))}
     config = load_config(runs[0] / "config.yaml")
     games, total = config.tasks.names, config.total_steps
-    protocol = json.loads(max(runs[0].glob("evaluations/*.json")).read_text())["protocol"]
+    evaluation = json.loads(max(runs[0].glob("evaluations/*.json")).read_text())
+    protocol = EvaluationProtocol.from_dict(evaluation["protocol"])
     lines = [
         "# MinAtar: three games in one spiking network",
         "",
@@ -181,8 +183,7 @@ def minatar_page() -> str:
         "in the SwitchMT run. Its learning rate is 1e-4 without clipping (3e-4 killed 95 % of its ReLUs in a",
         "pilot run).",
         "",
-        f"Scores: raw returns of {protocol['episodes']} episodes, epsilon {protocol['epsilon']}, sticky actions "
-        f"{protocol['sticky_action_probability']}, seed {protocol['seed']}; mean ± 95 % confidence half-width.",
+        f"Scores: {protocol}; mean ± 95 % confidence half-width.",
         "",
         "| game | seed | random | SwitchMT, one for all | above random? | single-task ANN DQN | above random? |",
         "|---|---|---|---|---|---|---|",

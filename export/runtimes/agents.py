@@ -134,9 +134,10 @@ class OnnxAgent:
         names = [value.name for value in self.session.get_outputs()]
         return dict(zip(names, self.session.run(names, fed), strict=True))
 
-    def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]``; -inf where an action does not exist."""
-        values: npt.NDArray[np.float32] = self.decide(observation, np.full(len(observation), task))["q_values"]
+    def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]`` of a task (name or index); -inf where an action does not exist."""
+        tasks_B = np.full(len(observation), self.suite.index(task))
+        values: npt.NDArray[np.float32] = self.decide(observation, tasks_B)["q_values"]
         return values
 
 
@@ -163,13 +164,14 @@ class NirAgent:
         """Restart the random numbers of the ``rate`` encoding."""
         self._generator.manual_seed(seed)
 
-    def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]``; -inf where an action does not exist."""
+    def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]`` of a task (name or index); -inf where an action does not exist."""
+        index = self.suite.index(task)
         encoded = encode(self.suite, self.config, observation, self._generator)
-        outputs, _ = self.interpreters[self.suite.names[task]].run(encoded)
+        outputs, _ = self.interpreters[self.suite.names[index]].run(encoded)
         settings = self.config.network
         q_BA = read_out(outputs, settings.readout, settings.readout_beta)
-        return np.where(self.suite.valid_actions_KA[task], q_BA, np.float32(-np.inf))
+        return np.where(self.suite.valid_actions_KA[index], q_BA, np.float32(-np.inf))
 
 
 class ComparedAgent:
@@ -195,7 +197,7 @@ class ComparedAgent:
         self.engine.reseed(seed)
         self.reference.reseed(seed)
 
-    def q_values(self, observation: Observations, task: int) -> npt.NDArray[np.float32]:
+    def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
         """The engine's Q-values; the comparison is counted."""
         values, expected = self.engine.q_values(observation, task), self.reference.q_values(observation, task)
         self.compared.append((len(values), int((values.argmax(axis=1) == expected.argmax(axis=1)).sum())))

@@ -54,7 +54,7 @@ class Agent:
         Raises:
             TaskError: unknown task, or an observation of another shape.
         """
-        index = self.suite.index(task) if isinstance(task, str) else task
+        index = self.suite.index(task)
         expected = self.suite.observation_shape
         batch = observation[None] if observation.shape == expected else observation
         if batch.shape[1:] != expected:

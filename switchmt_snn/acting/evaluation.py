@@ -1,10 +1,10 @@
-"""Evaluation: episodes of each task under a stated protocol, raw scores, and what they mean beside known scores."""
+"""Evaluation: episodes of each task under a stated protocol, raw scores, and scores relative to known ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 
 QFunction = Callable[[npt.NDArray[Any], int], npt.NDArray[np.float32]]
@@ -31,24 +32,33 @@ class DecisionMaker(Protocol):
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of a random encoding."""
 
-    def q_values(self, observation: npt.NDArray[Any], task: int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]`` of stacked observations ``[B, ...]``, -inf where an action does not exist."""
+    def q_values(self, observation: npt.NDArray[Any], task: str | int) -> npt.NDArray[np.float32]:
+        """Q-values ``[B, A]`` of stacked observations ``[B, ...]`` of a task (name or index).
+
+        -inf where an action does not exist.
+        """
 
 
 @dataclass(frozen=True)
 class EvaluationProtocol:
-    """Everything that a score depends on besides the agent; printed beside every score."""
+    """Everything that a score depends on besides the agent; printed with every score.
+
+    Attributes:
+        episodes: per task.
+        epsilon: share of random actions.
+        seed: root of the episodes' seeds and of the random actions.
+        num_envs: episodes that are played side by side.
+        suite: value of ``tasks.suite``.
+        environment: the suite's conditions of play in words, as ``sticky actions 0.25``.
+        score: what is summed.
+    """
 
     episodes: int
     epsilon: float
     seed: int
     num_envs: int
     suite: str
-    sticky_action_probability: float
-    fire_on_reset: bool
-    noop_max: int
-    frame_skip: int
-    max_episode_frames: int
+    environment: tuple[str, ...] = ()
     score: str = "raw return, unclipped"
 
     @classmethod
@@ -60,22 +70,21 @@ class EvaluationProtocol:
             seed=evaluation.seed,
             num_envs=min(evaluation.num_envs, evaluation.episodes),
             suite=tasks.suite,
-            sticky_action_probability=tasks.sticky_action_probability,
-            fire_on_reset=tasks.fire_on_reset,
-            noop_max=tasks.noop_max,
-            frame_skip=tasks.frame_skip,
-            max_episode_frames=tasks.max_episode_frames,
+            environment=suite_of(tasks).protocol,
         )
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> EvaluationProtocol:
+        """The protocol in a stored evaluation; before version 0.2, every file had the settings of Atari as fields."""
+        own = {field.name: stored[field.name] for field in fields(cls) if field.name in stored}
+        if "environment" in stored:
+            return cls(**{**own, "environment": tuple(stored["environment"])})
+        settings = {field.name: stored[field.name] for field in fields(TasksConfig) if field.name in stored}
+        return cls(**own, environment=suite_of(TasksConfig(**settings)).protocol)
 
     def __str__(self) -> str:
         parts = [f"{self.episodes} episodes per task", f"epsilon {self.epsilon:g}", self.score, f"seed {self.seed}"]
-        if self.suite == "gym":
-            return ", ".join(parts)
-        parts.append(f"sticky actions {self.sticky_action_probability:g}")
-        if self.suite == "atari":
-            fire = "on" if self.fire_on_reset else "off"
-            parts += [f"fire on reset {fire}", f"no-ops <= {self.noop_max}", f"frame skip {self.frame_skip}"]
-        return ", ".join([*parts, f"frame cap {self.max_episode_frames:,}"])
+        return ", ".join([*parts, *self.environment])
 
 
 @dataclass(frozen=True)
@@ -245,7 +254,7 @@ def summarize(suite: TaskSuite, episodes: list[EpisodeScore]) -> TaskScore:
         mean=mean,
         median=float(np.median(scores)),
         standard_error=float(scores.std(ddof=1)) / math.sqrt(len(scores)) if len(scores) > 1 else None,
-        human_normalized=(mean - reference.random) / (reference.human - reference.random) if reference else None,
+        human_normalized=reference.normalized(mean) if reference else None,
         mean_length_steps=float(np.mean([episode.length_steps for episode in episodes])),
         mean_q=float(np.mean(q)) if q else None,
     )

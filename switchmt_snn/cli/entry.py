@@ -209,12 +209,15 @@ def _train(argv: list[str]) -> int:
 
 
 def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> None:
+    from switchmt_snn.tasks.registry import find_suite
+
     lines = []
-    if config.name == "quickstart" and config.tasks.suite == "atari":
+    needed = find_suite(config.tasks.suite).steps_to_learn
+    if needed is not None and config.total_steps < needed:
         lines.append(
-            "This run shows the machinery; it is far too short to learn Atari. What learns: 'switchmt-snn train "
-            "minatar' on a CPU (21 minutes where measured; scores: results/minatar/README.md; extra: minatar); "
-            "'switchmt-snn train paper' is meant for a GPU (its time is not measured yet)."
+            f"This run is far too short to learn {', '.join(config.tasks.names)} (fewer than {needed:,} steps). What "
+            "learns: 'switchmt-snn train minatar' on a CPU (about 20 minutes; scores: results/minatar/README.md; "
+            "extra: minatar); 'switchmt-snn train paper' is meant for a GPU."
         )
     lines += [
         "Next:",
@@ -377,11 +380,11 @@ def _describe(argv: list[str]) -> int:
 def _doctor(argv: list[str]) -> int:
     options = _parse(DoctorOptions, argv, "doctor", DoctorOptions())
     import torch
-    from ale_py import roms
 
     from switchmt_snn.machine.devices import has_bfloat16, select_device
     from switchmt_snn.machine.memory import GIB, available_bytes
     from switchmt_snn.runs.folder import describe_environment
+    from switchmt_snn.tasks.registry import SUITES
     from switchmt_snn.updates.choice import built_engines
 
     device = select_device("auto")
@@ -389,7 +392,7 @@ def _doctor(argv: list[str]) -> int:
     facts = {key: facts[key] for key in ("versions", "python", "platform", "processor", "cores", "device")}
     facts |= {
         "torch_threads": torch.get_num_threads(),
-        "atari_games": len(roms.get_all_rom_ids()),
+        "tasks": {name: len(suite.known_tasks()) for name, suite in SUITES.items()},
         "available_memory_gib": round(available_bytes() / GIB, 1),
         "bfloat16_instructions": has_bfloat16(device),
         **built_engines(),
@@ -444,7 +447,3 @@ def _one_line(boxed: str, command: str) -> str:
     text = " ".join(line for line in lines if not set(line) <= set("─-"))
     text = text.split("For full helptext")[0].split("Argument helptext")[0].strip().rstrip(".")
     return f"{text}; see switchmt-snn {command} --help"
-
-
-if __name__ == "__main__":
-    main()

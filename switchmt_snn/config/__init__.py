@@ -21,6 +21,7 @@ from switchmt_snn.config.experiment import (
     resolve,
     resolved_frame_stack,
 )
+from switchmt_snn.config.suites import SuiteDefaults
 from switchmt_snn.config.yaml_io import differences, field_documentation, from_dict, load_config, to_dict, to_yaml
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "NetworkConfig",
     "Policy",
     "RecordingConfig",
+    "SuiteDefaults",
     "SwitchingConfig",
     "TasksConfig",
     "differences",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
+from switchmt_snn.config.suites import require_suite_name, stored_suite_name, suite_defaults
 from switchmt_snn.errors import ConfigError
 
 Method = Literal["DQN", "DSQN", "DQN_D", "DSQN_D", "MTSpark_AD", "MTSpark_ADD", "SwitchMT"]
@@ -56,14 +57,14 @@ def _require(holds: bool, key: str, seen: object, expected: str, remedy: str = "
 class TasksConfig:
     """Which tasks are learned, and how their environments are set up."""
 
-    suite: Literal["atari", "minatar", "gym"] = "atari"
-    """Where the task names are looked up: ALE games, MinAtar games, or Gymnasium ids."""
+    suite: str = "atari"
+    """Where names are looked up: atari, minatar, gym (Gymnasium ids), or package.module:Name, a Suite of your own."""
     names: tuple[str, ...] = ("pong", "breakout", "enduro")
-    """Tasks in the order in which training visits them."""
+    """Tasks in the order in which training visits them. In the gym suite, module:MyEnv-v0 imports module first."""
     num_envs: int = 1
     """Copies of the current task that are stepped together; one vector step counts as this many agent steps."""
     frame_stack: int | None = None
-    """Newest frames that form one observation; null takes 4 for Atari and 1 elsewhere."""
+    """Newest frames that form one observation; null takes the suite's number: atari 4, minatar and gym 1."""
     frame_skip: int = 4
     """Atari: emulator frames per agent step; the last two are max-pooled."""
     sticky_action_probability: float = 0.0
@@ -78,6 +79,7 @@ class TasksConfig:
     """Atari and MinAtar: an episode is truncated after this many frames (in Atari 108,000 are 30 minutes of play)."""
 
     def __post_init__(self) -> None:
+        require_suite_name(self.suite)
         _require(len(self.names) > 0, "tasks.names", self.names, "at least one task")
         _require(len(set(self.names)) == len(self.names), "tasks.names", self.names, "every task once")
         _require(self.num_envs >= 1, "tasks.num_envs", self.num_envs, "at least 1")
@@ -413,8 +415,8 @@ class ExperimentConfig:
 
 
 def resolved_frame_stack(tasks: TasksConfig) -> int:
-    """Frames per observation once null is resolved: 4 for Atari, 1 for MinAtar and Gymnasium."""
-    return tasks.frame_stack or (4 if tasks.suite == "atari" else 1)
+    """Frames per observation; null takes the suite's default."""
+    return tasks.frame_stack or suite_defaults(tasks.suite).frame_stack
 
 
 def resolve(config: ExperimentConfig) -> ExperimentConfig:
@@ -424,23 +426,21 @@ def resolve(config: ExperimentConfig) -> ExperimentConfig:
     """
     traits = METHOD_TRAITS[config.network.method]
     network = config.network
-    trunk = network.trunk
-    if trunk == "auto":
-        trunk = {"atari": "nature", "minatar": "minatar", "gym": "mlp"}[config.tasks.suite]  # type: ignore[assignment]
+    trunk = suite_defaults(config.tasks.suite).trunk if network.trunk == "auto" else network.trunk
     dendrites = network.dendrites
     if dendrites == "auto":
         dendrites = "shared" if traits.dendrites else "none"
     network = replace(
         network,
-        trunk=trunk,
+        trunk=trunk,  # type: ignore[arg-type]
         dendrites=dendrites,
         hidden_units=network.hidden_units or (512 if trunk == "nature" else 128),
         timesteps=network.timesteps if traits.spiking else 1,
     )
-    policy = config.switching.policy
+    policy, tasks = config.switching.policy, config.tasks
     return replace(
         config,
-        tasks=replace(config.tasks, frame_stack=resolved_frame_stack(config.tasks)),
+        tasks=replace(tasks, suite=stored_suite_name(tasks.suite), frame_stack=resolved_frame_stack(tasks)),
         network=network,
         switching=replace(config.switching, policy=traits.switching if policy == "auto" else policy),
     )

@@ -12,7 +12,7 @@ from switchmt_snn.config import METHOD_TRAITS, METHODS, ExperimentConfig, resolv
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.runs.memory import MemoryEstimate, estimate_memory
 from switchmt_snn.spiking.network import QNetwork, Stream, TrunkLayer, build_network, trainable_parameters
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 

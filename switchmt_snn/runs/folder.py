@@ -30,6 +30,7 @@ from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDe
 from switchmt_snn.learning.switching import SwitchTo
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.files import write_atomically
+from switchmt_snn.tasks.registry import SUITES, suite_of
 
 RUNS = Path("runs")
 EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncated", "epsilon", "updates", "wall_s")
@@ -59,7 +60,8 @@ SWITCH_COLUMNS = (
     "visit_episodes",
     "visit_steps",
 )
-_PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "gymnasium", "ale-py", "minatar", "safetensors", "zstandard")
+_PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "safetensors", "zstandard")
+"""Distributions whose versions a run stores, with those that suites name."""
 
 
 def new_run_path(name: str) -> Path:
@@ -283,9 +285,11 @@ class RunLogs:
 
 
 def describe_environment(config: ExperimentConfig, device: torch.device) -> dict[str, Any]:
-    """Facts that a reader of the run's numbers needs: versions, machine, device, ROM checksums, command."""
+    """Facts that a reader of the run's numbers needs: versions, machine, device, files of the suite, command."""
+    suite = suite_of(config.tasks)
+    suites = (*SUITES.values(), type(suite))
     versions: dict[str, str | None] = {}
-    for package in _PACKAGES:
+    for package in dict.fromkeys((*_PACKAGES, *(package for each in suites for package in each.packages))):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
@@ -302,7 +306,7 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
         "device": str(device),
         "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
         "versions": versions,
-        "rom_sha256": _rom_sums(config),
+        "files_sha256": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in suite.files.items()},
     }
 
 
@@ -326,14 +330,6 @@ def processor() -> str:
     except OSError:
         pass
     return platform.processor()
-
-
-def _rom_sums(config: ExperimentConfig) -> dict[str, str]:
-    if config.tasks.suite != "atari":
-        return {}
-    from ale_py import roms
-
-    return {name: hashlib.sha256(Path(roms.get_rom_path(name)).read_bytes()).hexdigest() for name in config.tasks.names}
 
 
 def _unwritable(path: Path, error: OSError) -> str:

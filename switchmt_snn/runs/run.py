@@ -33,7 +33,7 @@ from switchmt_snn.runs.folder import (
 )
 from switchmt_snn.runs.memory import require_gpu_memory, require_memory
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.updates.choice import settle
 from switchmt_snn.updates.processes import ProcessGroup, join_processes
 

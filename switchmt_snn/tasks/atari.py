@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 from ale_py import Action, roms
 from ale_py.vector_env import AtariVectorEnv
 
-from switchmt_snn.config import TasksConfig
+from switchmt_snn.config import TasksConfig, resolved_frame_stack
+from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError, did_you_mean
-from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES
-from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite, VectorStep
+from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PUBLISHED_SCORES
+from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite, VectorStep
 
 SIDE_PIXELS = 84
 
@@ -65,43 +68,87 @@ class AtariCopies:
         self._env.close()
 
 
-def make_atari_suite(config: TasksConfig) -> TaskSuite:
-    """Suite of ALE games by ROM name (``pong``, ``space_invaders``).
+class AtariSuite(Suite):
+    """ALE games by ROM name (``pong``, ``space_invaders``)."""
 
-    Raises:
-        TaskError: unknown game, or games of different action counts without ``full_action_space``.
-    """
-    known = roms.get_all_rom_ids()
-    for name in config.names:
-        if name not in known:
-            raise TaskError(f"tasks.names has the unknown Atari game {name!r}{did_you_mean(name, known)}")
+    name = "atari"
+    defaults = SUITE_DEFAULTS["atari"]
+    examples = ("pong", "breakout")
+    packages = ("ale-py", "gymnasium")
+    frames_per_s = 60.0
+    # Rainbow stays near random play in most games for this many steps (Kaiser et al. 2020, arXiv 1903.00374).
+    steps_to_learn = 100_000
+    references = ATARI_REFERENCES
+    published = PUBLISHED_SCORES
+
+    @classmethod
+    def known_tasks(cls) -> tuple[str, ...]:
+        """Games whose ROMs come with ale-py."""
+        return tuple(roms.get_all_rom_ids())
+
+    @property
+    def frame_skip(self) -> int:
+        """Emulator frames per agent step."""
+        return self.config.frame_skip
+
+    @property
+    def protocol(self) -> tuple[str, ...]:
+        """Sticky actions, how an episode starts, frame skip, and the longest episode."""
+        config = self.config
+        return (
+            f"sticky actions {config.sticky_action_probability:g}",
+            f"fire on reset {'on' if config.fire_on_reset else 'off'}",
+            f"no-ops <= {config.noop_max}",
+            f"frame skip {config.frame_skip}",
+            f"frame cap {config.max_episode_frames:,}",
+        )
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The ROMs."""
+        return {name: Path(roms.get_rom_path(name)) for name in self.config.names}
+
+    def make(self) -> TaskSuite:
+        """Make the games.
+
+        Raises:
+            TaskError: unknown game, or games of different action counts without ``full_action_space``.
+        """
+        config, known = self.config, self.known_tasks()
+        for name in config.names:
+            if name not in known:
+                raise TaskError(f"tasks.names has the unknown Atari game {name!r}{did_you_mean(name, known)}")
+        action_names = _action_names(config)
+
+        def make(task: int, num_envs: int) -> TaskEnvironment:
+            return AtariCopies(config.names[task], num_envs, config)
+
+        return TaskSuite(
+            names=config.names,
+            frame_shape=(1, SIDE_PIXELS, SIDE_PIXELS),
+            frame_dtype=np.uint8,
+            frame_stack=resolved_frame_stack(config),
+            scale=1.0 / 255.0,
+            in_unit_range=True,
+            action_names=action_names,
+            valid_actions_KA=np.ones((len(config.names), len(action_names)), np.bool_),
+            references={name: self.references[name] for name in config.names if name in self.references},
+            make=make,
+        )
+
+
+def _action_names(config: TasksConfig) -> tuple[str, ...]:
+    """One meaning per action: all 18, or the minimal set if the games agree on it."""
     if config.full_action_space:
-        action_names = tuple(action.name for action in Action.__members__.values())[:18]
-    else:
-        counts = {name: _minimal_actions(name, config) for name in config.names}
-        if len(set(counts.values())) > 1:
-            shown = ", ".join(f"{name} {len(actions)}" for name, actions in counts.items())
-            raise TaskError(
-                f"tasks.full_action_space is false and the games' minimal action sets differ ({shown}), "
-                "expected one meaning per action; set tasks.full_action_space to true"
-            )
-        action_names = next(iter(counts.values()))
-
-    def make(task: int, num_envs: int) -> TaskEnvironment:
-        return AtariCopies(config.names[task], num_envs, config)
-
-    return TaskSuite(
-        names=config.names,
-        frame_shape=(1, SIDE_PIXELS, SIDE_PIXELS),
-        frame_dtype=np.uint8,
-        frame_stack=config.frame_stack or 4,
-        scale=1.0 / 255.0,
-        in_unit_range=True,
-        action_names=action_names,
-        valid_actions_KA=np.ones((len(config.names), len(action_names)), np.bool_),
-        references={name: ATARI_REFERENCES[name] for name in config.names if name in ATARI_REFERENCES},
-        make=make,
-    )
+        return tuple(action.name for action in Action.__members__.values())[:18]
+    counts = {name: _minimal_actions(name, config) for name in config.names}
+    if len(set(counts.values())) > 1:
+        shown = ", ".join(f"{name} {len(actions)}" for name, actions in counts.items())
+        raise TaskError(
+            f"tasks.full_action_space is false and the games' minimal action sets differ ({shown}), "
+            "expected one meaning per action; set tasks.full_action_space to true"
+        )
+    return next(iter(counts.values()))
 
 
 def _minimal_actions(game: str, config: TasksConfig) -> tuple[str, ...]:

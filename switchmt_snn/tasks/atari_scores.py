@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from switchmt_snn.tasks.suite import Reference
+from switchmt_snn.tasks.suite import PublishedScores, Reference
 
 _WANG_2016 = """
 alien 227.8 7127.7
@@ -65,12 +65,15 @@ zaxxon 32.5 9173.3
 """
 """Game, random agent, professional human tester: raw returns under 1-30 no-ops and at most 108,000 frames."""
 
+_WANG = "Wang et al. 2016, arXiv 1511.06581"
+_SWITCHMT = "the SwitchMT paper: its performance table and its ablation text; five episodes, one seed"
+
 ATARI_REFERENCES: dict[str, Reference] = {
-    game: Reference(float(random), float(human), "Wang et al. 2016, arXiv 1511.06581")
+    game: Reference(float(random), float(human), _WANG)
     for game, random, human in (line.split() for line in _WANG_2016.strip().splitlines())
 }
 
-PAPER_SCORES: dict[str, dict[str, float]] = {
+_PAPER_SCORES: dict[str, dict[str, float]] = {
     "DQN (paper)": {"pong": -18.6, "breakout": 3.2, "enduro": 0.0},
     "DSQN (paper)": {"pong": -11.2, "breakout": 0.4, "enduro": 362.2},
     "DQN_D (paper)": {"pong": -20.2, "breakout": 0.0, "enduro": 0.0},
@@ -80,4 +83,9 @@ PAPER_SCORES: dict[str, dict[str, float]] = {
     "SwitchMT (paper)": {"pong": -8.8, "breakout": 5.6, "enduro": 355.2},
     "human (paper)": {"pong": -3.0, "breakout": 31.0, "enduro": 368.0},
 }
-"""Raw scores of the SwitchMT paper (its performance table and its ablation text): five episodes, one seed."""
+
+PUBLISHED_SCORES = (
+    *(PublishedScores(policy, _SWITCHMT, scores) for policy, scores in _PAPER_SCORES.items()),
+    PublishedScores("random (Wang 2016)", _WANG, {game: row.random for game, row in ATARI_REFERENCES.items()}),
+    PublishedScores("human (Wang 2016)", _WANG, {game: row.human for game, row in ATARI_REFERENCES.items()}),
+)

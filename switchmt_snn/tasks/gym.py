@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.config import TasksConfig
+from switchmt_snn.config import resolved_frame_stack
+from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError, did_you_mean
-from switchmt_snn.tasks.suite import Frames, TaskEnvironment, TaskSuite, VectorStep
+from switchmt_snn.tasks.suite import Frames, Suite, TaskEnvironment, TaskSuite, VectorStep
 
 Env = gymnasium.Env[Any, Any]
 
@@ -82,55 +85,79 @@ def channels_first(observation: Any) -> npt.NDArray[Any]:
     return array[None] if array.ndim == 2 else array
 
 
-def make_gym_suite(config: TasksConfig) -> TaskSuite:
-    """Suite of Gymnasium ids.
+class GymSuite(Suite):
+    """Gymnasium ids; ``my_module:MyEnv-v0`` imports ``my_module``, which registers the id, first."""
 
-    Raises:
-        TaskError: an id is unknown or cannot be made, actions are not discrete, observations are not boxes of one to
-            three dimensions, or images and vectors are mixed.
-    """
-    probes = [_make_env(name) for name in config.names]
-    shapes, counts = [], []
-    for name, env in zip(config.names, probes, strict=True):
-        actions, observations = env.action_space, env.observation_space
-        if not isinstance(actions, gymnasium.spaces.Discrete):
-            raise TaskError(
-                f"task {name!r} has the action space {actions}, expected Discrete: a Q-network lists actions"
-            )
-        box = isinstance(observations, gymnasium.spaces.Box) and 1 <= len(observations.shape) <= 3
-        if not box:
-            raise TaskError(f"task {name!r} observes {observations}, expected a Box of an image or a vector")
-        shapes.append(channels_first(np.zeros(observations.shape or (), observations.dtype)).shape)
-        counts.append(int(actions.n))
-    images = {len(shape) == 3 for shape in shapes}
-    if len(images) > 1:
-        raise TaskError(f"tasks {', '.join(config.names)} mix images and vectors, expected one kind in one network")
-    is_image = images.pop()
-    bytes_only = all(env.observation_space.dtype == np.uint8 for env in probes)
-    if is_image and not bytes_only:
-        raise TaskError("image tasks must have uint8 observations; wrap the environment to return bytes")
-    for env in probes:
-        env.close()
-    frame_shape = tuple(int(side) for side in np.max(np.asarray(shapes), axis=0))
-    dtype: npt.DTypeLike = np.uint8 if is_image else np.float32
-    num_actions = max(counts)
+    name = "gym"
+    defaults = SUITE_DEFAULTS["gym"]
+    examples = ("CartPole-v1", "Acrobot-v1")
+    packages = ("gymnasium",)
 
-    def make(task: int, num_envs: int) -> TaskEnvironment:
-        envs = [_make_env(config.names[task]) for _ in range(num_envs)]
-        return GymCopies(envs, frame_shape, dtype, channels_first)
+    @classmethod
+    def known_tasks(cls) -> tuple[str, ...]:
+        """Ids that are registered now."""
+        return tuple(gymnasium.registry)
 
-    return TaskSuite(
-        names=config.names,
-        frame_shape=frame_shape,
-        frame_dtype=dtype,
-        frame_stack=config.frame_stack or 1,
-        scale=1.0 / 255.0 if is_image else 1.0,
-        in_unit_range=is_image,
-        action_names=tuple(f"action_{a}" for a in range(num_actions)),
-        valid_actions_KA=np.arange(num_actions)[None, :] < np.asarray(counts)[:, None],
-        references={},
-        make=make,
-    )
+    @property
+    def files(self) -> dict[str, Path]:
+        """The modules that tasks name before a colon."""
+        modules = dict.fromkeys(name.split(":")[0] for name in self.config.names if ":" in name)
+        specs = {module: importlib.util.find_spec(module) for module in modules}
+        return {module: Path(spec.origin) for module, spec in specs.items() if spec is not None and spec.origin}
+
+    def make(self) -> TaskSuite:
+        """Make the environments.
+
+        Raises:
+            TaskError: an id is unknown or cannot be made, actions are not discrete, observations are not boxes of one
+                to three dimensions, or images and vectors are mixed.
+        """
+        names = self.config.names
+        probes = [_make_env(name) for name in names]
+        counts = [_num_actions(name, env) for name, env in zip(names, probes, strict=True)]
+        shapes = [_frame_shape(name, env) for name, env in zip(names, probes, strict=True)]
+        images = {len(shape) == 3 for shape in shapes}
+        if len(images) > 1:
+            raise TaskError(f"tasks {', '.join(names)} mix images and vectors, expected one kind in one network")
+        is_image = images.pop()
+        if is_image and not all(env.observation_space.dtype == np.uint8 for env in probes):
+            raise TaskError("image tasks must have uint8 observations; wrap the environment to return bytes")
+        for env in probes:
+            env.close()
+        frame_shape = tuple(int(side) for side in np.max(np.asarray(shapes), axis=0))
+        dtype: npt.DTypeLike = np.uint8 if is_image else np.float32
+        num_actions = max(counts)
+
+        def make(task: int, num_envs: int) -> TaskEnvironment:
+            envs = [_make_env(names[task]) for _ in range(num_envs)]
+            return GymCopies(envs, frame_shape, dtype, channels_first)
+
+        return TaskSuite(
+            names=names,
+            frame_shape=frame_shape,
+            frame_dtype=dtype,
+            frame_stack=resolved_frame_stack(self.config),
+            scale=1.0 / 255.0 if is_image else 1.0,
+            in_unit_range=is_image,
+            action_names=tuple(f"action_{a}" for a in range(num_actions)),
+            valid_actions_KA=np.arange(num_actions)[None, :] < np.asarray(counts)[:, None],
+            references={},
+            make=make,
+        )
+
+
+def _num_actions(name: str, env: Env) -> int:
+    actions = env.action_space
+    if not isinstance(actions, gymnasium.spaces.Discrete):
+        raise TaskError(f"task {name!r} has the action space {actions}, expected Discrete: a Q-network lists actions")
+    return int(actions.n)
+
+
+def _frame_shape(name: str, env: Env) -> tuple[int, ...]:
+    space = env.observation_space
+    if not (isinstance(space, gymnasium.spaces.Box) and 1 <= len(space.shape) <= 3):
+        raise TaskError(f"task {name!r} observes {space}, expected a Box of an image or a vector")
+    return channels_first(np.zeros(space.shape, space.dtype)).shape
 
 
 def _make_env(name: str) -> Env:
@@ -138,6 +165,14 @@ def _make_env(name: str) -> Env:
         return gymnasium.make(name)
     except gymnasium.error.DependencyNotInstalled as error:
         raise TaskError(f"task {name!r} needs a package that is not installed ({error})") from error
-    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+    except ImportError as error:
+        if ":" in name:
+            module = name.split(":")[0]
+            raise TaskError(
+                f"tasks.names has {name!r}, expected an importable module before the colon, but importing {module!r} "
+                f"fails ({str(error).split('. ')[0]}); install it, or add its folder to PYTHONPATH"
+            ) from error
+        raise TaskError(f"task {name!r} cannot be made ({error})") from error
+    except (gymnasium.error.Error, ValueError) as error:
         hint = did_you_mean(name, gymnasium.registry.keys())
         raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{hint}") from error

@@ -7,54 +7,75 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from switchmt_snn.config import TasksConfig
+from switchmt_snn.config import TasksConfig, resolved_frame_stack
+from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import MissingExtraError, TaskError, did_you_mean
 from switchmt_snn.tasks.gym import Env, GymCopies, channels_first
-from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite
+from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
 
 GAMES = ("asterix", "breakout", "freeway", "seaquest", "space_invaders")
 ACTION_NAMES = ("NOOP", "LEFT", "UP", "RIGHT", "DOWN", "FIRE")
 SIDE_CELLS = 10
 
 
-def make_minatar_suite(config: TasksConfig) -> TaskSuite:
-    """Suite of MinAtar games; channels are padded with zeros to the game that has most.
+class MinAtarSuite(Suite):
+    """MinAtar games by name (``breakout``); channels are padded with zeros to the game that has most."""
 
-    Raises:
-        TaskError: unknown game.
-        MissingExtraError: MinAtar is not installed.
-    """
-    for name in config.names:
-        if name not in GAMES:
-            raise TaskError(f"tasks.names has the unknown MinAtar game {name!r}{did_you_mean(name, GAMES)}")
+    name = "minatar"
+    defaults = SUITE_DEFAULTS["minatar"]
+    examples = ("breakout", "asterix")
+    packages = ("minatar", "gymnasium")
+
+    @classmethod
+    def known_tasks(cls) -> tuple[str, ...]:
+        """The five games."""
+        return GAMES
+
+    @property
+    def protocol(self) -> tuple[str, ...]:
+        """Sticky actions and the longest episode."""
+        config = self.config
+        return (f"sticky actions {config.sticky_action_probability:g}", f"frame cap {config.max_episode_frames:,}")
+
+    def make(self) -> TaskSuite:
+        """Make the games.
+
+        Raises:
+            TaskError: unknown game.
+            MissingExtraError: MinAtar is not installed.
+        """
+        config = self.config
+        for name in config.names:
+            if name not in GAMES:
+                raise TaskError(f"tasks.names has the unknown MinAtar game {name!r}{did_you_mean(name, GAMES)}")
+        channels = max(int(_make_env(name, config).unwrapped.observation_space.shape[2]) for name in config.names)  # type: ignore[index]
+        frame_shape = (channels, SIDE_CELLS, SIDE_CELLS)
+
+        def make(task: int, num_envs: int) -> TaskEnvironment:
+            envs = [_make_env(config.names[task], config) for _ in range(num_envs)]
+            return GymCopies(envs, frame_shape, np.uint8, channels_first, before_reset=_forget_previous_action)
+
+        return TaskSuite(
+            names=config.names,
+            frame_shape=frame_shape,
+            frame_dtype=np.uint8,
+            frame_stack=resolved_frame_stack(config),
+            scale=1.0,
+            in_unit_range=True,
+            action_names=ACTION_NAMES,
+            valid_actions_KA=np.ones((len(config.names), len(ACTION_NAMES)), np.bool_),
+            references={},
+            make=make,
+        )
+
+
+def _make_env(game: str, config: TasksConfig) -> Env:
     try:
         from minatar.gym import BaseEnv
     except ModuleNotFoundError as error:
         raise MissingExtraError("MinAtar is not installed; run: pip install 'switchmt-snn[minatar]'") from error
-
-    def make_env(name: str) -> Env:
-        game = BaseEnv(name, sticky_action_prob=config.sticky_action_probability)
-        return gymnasium.wrappers.TimeLimit(game, max_episode_steps=config.max_episode_frames)
-
-    channels = max(int(make_env(name).unwrapped.observation_space.shape[2]) for name in config.names)  # type: ignore[index]
-    frame_shape = (channels, SIDE_CELLS, SIDE_CELLS)
-
-    def make(task: int, num_envs: int) -> TaskEnvironment:
-        envs = [make_env(config.names[task]) for _ in range(num_envs)]
-        return GymCopies(envs, frame_shape, np.uint8, channels_first, before_reset=_forget_previous_action)
-
-    return TaskSuite(
-        names=config.names,
-        frame_shape=frame_shape,
-        frame_dtype=np.uint8,
-        frame_stack=config.frame_stack or 1,
-        scale=1.0,
-        in_unit_range=True,
-        action_names=ACTION_NAMES,
-        valid_actions_KA=np.ones((len(config.names), len(ACTION_NAMES)), np.bool_),
-        references={},
-        make=make,
-    )
+    env = BaseEnv(game, sticky_action_prob=config.sticky_action_probability)
+    return gymnasium.wrappers.TimeLimit(env, max_episode_steps=config.max_episode_frames)
 
 
 def _forget_previous_action(env: Any) -> None:

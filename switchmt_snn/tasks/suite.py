@@ -1,14 +1,20 @@
-"""A suite: several tasks with one frame shape and one action count, so that one network serves them all."""
+"""What a suite of tasks is: :class:`Suite` states its facts, :class:`TaskSuite` is what it makes from a config.
+
+The tasks of a :class:`TaskSuite` share one frame shape and one action count, so that one network serves them all.
+"""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from switchmt_snn.config import SuiteDefaults, TasksConfig
 from switchmt_snn.errors import TaskError, did_you_mean
 
 Frames = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
@@ -51,11 +57,15 @@ class TaskEnvironment(Protocol):
 
 @dataclass(frozen=True)
 class Reference:
-    """Published raw scores of a task, for normalising: ``(score - random) / (human - random)``."""
+    """Published raw scores of a task, for normalised scores."""
 
     random: float
     human: float
     source: str
+
+    def normalized(self, score: float) -> float:
+        """``(score - random) / (human - random)``: 0 for random play, 1 for the human."""
+        return (score - self.random) / (self.human - self.random)
 
 
 @dataclass(frozen=True)
@@ -96,12 +106,97 @@ class TaskSuite:
         """The stacked observation: ``(k*c, H, W)`` or ``(k*features,)``."""
         return (self.frame_stack * self.frame_shape[0], *self.frame_shape[1:])
 
-    def index(self, name: str) -> int:
-        """Index of a task by name.
+    def index(self, task: str | int) -> int:
+        """Index of a task that is given by name or by index.
 
         Raises:
             TaskError: the suite has no such task.
         """
-        if name not in self.names:
-            raise TaskError(f"unknown task {name!r}{did_you_mean(name, self.names)}")
-        return self.names.index(name)
+        if isinstance(task, str):
+            if task not in self.names:
+                raise TaskError(f"unknown task {task!r}{did_you_mean(task, self.names)}")
+            return self.names.index(task)
+        if not 0 <= task < len(self.names):
+            raise TaskError(f"task is {task}, expected a name or an index from 0 to {len(self.names) - 1}")
+        return int(task)
+
+
+@dataclass(frozen=True)
+class PublishedScores:
+    """Published raw scores of one policy, for reference rows under an evaluation.
+
+    Attributes:
+        policy: name of the row, as ``human (Wang 2016)``.
+        source: where the scores were published.
+        scores: mean raw score by task.
+    """
+
+    policy: str
+    source: str
+    scores: dict[str, float]
+
+
+class Suite:
+    """A family of tasks: every fact that the program states about them, and how to make them.
+
+    A subclass states ``name``, ``defaults`` and ``examples`` and implements :meth:`make`; everything else has a
+    default. It must be at the top level of a module, because a run stores it as ``package.module:Name``.
+
+    Attributes:
+        name: short name, a value of ``tasks.suite`` once the suite is registered.
+        defaults: frame stack and trunk where a config leaves them open.
+        examples: tasks that can be learned together; tests and ``doctor`` use them.
+        packages: distributions whose versions a run stores.
+        frames_per_s: emulator frames per second of real time; None if the tasks have no clock.
+        steps_to_learn: training for fewer agent steps teaches nothing, and a short run says so; None says nothing.
+        references: random and human scores by task, for normalised scores.
+        published: rows that are printed under an evaluation.
+        config: the tasks that a config asks for.
+    """
+
+    name: ClassVar[str]
+    defaults: ClassVar[SuiteDefaults]
+    examples: ClassVar[tuple[str, ...]]
+    packages: ClassVar[tuple[str, ...]] = ()
+    frames_per_s: ClassVar[float | None] = None
+    steps_to_learn: ClassVar[int | None] = None
+    references: ClassVar[dict[str, Reference]] = {}
+    published: ClassVar[tuple[PublishedScores, ...]] = ()
+
+    def __init__(self, config: TasksConfig) -> None:
+        self.config = config
+
+    def make(self) -> TaskSuite:
+        """Make the tasks of the config.
+
+        Raises:
+            TaskError: a task does not exist, or does not fit a Q-network.
+            MissingExtraError: an optional package is needed.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def known_tasks(cls) -> tuple[str, ...]:
+        """Names of all tasks that are known; a suite of open names lists those that it finds."""
+        return cls.examples
+
+    @property
+    def frame_skip(self) -> int:
+        """Emulator frames per agent step."""
+        return 1
+
+    @property
+    def decisions_per_s(self) -> float | None:
+        """Agent steps per second of real time; None if the tasks have no clock."""
+        return None if self.frames_per_s is None else self.frames_per_s / self.frame_skip
+
+    @property
+    def protocol(self) -> tuple[str, ...]:
+        """Conditions of play that a score depends on, in words, as ``sticky actions 0.25``."""
+        return ()
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Files that decide what is learned, by a short name: a run stores their SHA-256. Here the suite's module."""
+        module = type(self).__module__
+        return {} if module.startswith("switchmt_snn.") else {module: Path(inspect.getfile(type(self)))}

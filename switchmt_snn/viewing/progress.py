@@ -14,6 +14,7 @@ from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped,
 from switchmt_snn.learning.switching import SwitchTo
 from switchmt_snn.learning.training import Training
 from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.viewing.health import health_warnings
 
 RETURN_WINDOW_EPISODES = 20
@@ -42,7 +43,7 @@ class Progress:
         self._returns: list[deque[float]] = [deque(maxlen=RETURN_WINDOW_EPISODES) for _ in training.suite.names]
         self._started, self._first_step = time.monotonic(), training.steps
         config = training.config
-        network, skip = config.network, config.tasks.frame_skip if config.tasks.suite == "atari" else 1
+        network, skip = config.network, suite_of(config.tasks).frame_skip
         where = f"continuing {folder.path} at step {resumed_at:,}" if resumed_at is not None else f"run {folder.path}"
         self.console.print(
             f"{where}: {network.method} on {', '.join(training.suite.names)}, T={network.timesteps}, "

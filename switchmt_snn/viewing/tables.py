@@ -10,7 +10,8 @@ from rich.table import Table
 from switchmt_snn.acting.evaluation import Evaluation, TaskScore
 from switchmt_snn.machine.memory import GIB
 from switchmt_snn.runs.description import MethodDescription
-from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PAPER_SCORES
+from switchmt_snn.tasks.registry import find_suite
+from switchmt_snn.tasks.suite import Suite
 
 
 def _table(title: str, caption: str | None = None) -> Table:
@@ -34,32 +35,25 @@ def _add_columns(table: Table, left: tuple[str, ...], right: tuple[str, ...]) ->
 
 
 def evaluation_table(evaluation: Evaluation) -> Table:
-    """Scores of agent and random policy, and published rows for Atari games beneath."""
+    """Scores of agent and random policy, then the rows that the suite knows from publications."""
     table = _table(f"Scores at step {evaluation.step:,}", str(evaluation.protocol))
     _add_columns(table, ("policy", "task"), ("mean", "± s.e.", "median", "human", "steps", "mean Q", "n"))
     for row in evaluation.tasks:
         table.add_row(*_score_cells(row))
-    if evaluation.protocol.suite == "atari":
+    suite = find_suite(evaluation.protocol.suite)
+    rows = published_rows(suite, list(dict.fromkeys(row.task for row in evaluation.tasks)))
+    if rows:
         table.add_section()
-        names = list(dict.fromkeys(row.task for row in evaluation.tasks))
-        for policy, task, mean in published_rows(names):
-            table.add_row(policy, task, f"{mean:.1f}", "", "", _percent(_normalized(task, mean)), "", "", "")
+    for policy, task, mean in rows:
+        reference = suite.references.get(task)
+        normalized = None if reference is None else reference.normalized(mean)
+        table.add_row(policy, task, f"{mean:.1f}", "", "", _percent(normalized), "", "", "")
     return table
 
 
-def published_rows(tasks: list[str]) -> list[tuple[str, str, float]]:
-    """Published raw scores of tasks: (policy, task, mean)."""
-    rows = [(policy, task, scores[task]) for policy, scores in PAPER_SCORES.items() for task in tasks if task in scores]
-    for task in tasks:
-        if task in ATARI_REFERENCES:
-            reference = ATARI_REFERENCES[task]
-            rows += [("random (Wang 2016)", task, reference.random), ("human (Wang 2016)", task, reference.human)]
-    return rows
-
-
-def _normalized(task: str, score: float) -> float | None:
-    reference = ATARI_REFERENCES.get(task)
-    return None if reference is None else (score - reference.random) / (reference.human - reference.random)
+def published_rows(suite: type[Suite], tasks: list[str]) -> list[tuple[str, str, float]]:
+    """Published raw scores of a suite's tasks: (policy, task, mean)."""
+    return [(row.policy, task, row.scores[task]) for row in suite.published for task in tasks if task in row.scores]
 
 
 def _percent(value: float | None) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -22,10 +23,12 @@ from switchmt_snn.acting.evaluation import (
     summarize,
 )
 from switchmt_snn.config import EvaluationConfig, TasksConfig
+from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.atari import AtariSuite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import Reference
 from switchmt_snn.viewing.tables import published_rows
 from tests.conftest import CountingEnvironment, small_config, vector_suite
@@ -109,7 +112,9 @@ def test_agent_acts_on_one_observation_and_on_batches() -> None:
     actions = agent.act(batch, "asterix")
     assert actions.shape == (5,)
     assert isinstance(agent.act(batch[0], "asterix"), int)
-    assert agent.q_values(batch[0], 1).shape == (6,)
+    assert np.array_equal(agent.q_values(batch[0], 1), agent.q_values(batch[0], "asterix"))
+    with pytest.raises(TaskError, match="task is 2, expected a name or an index from 0 to 1"):
+        agent.q_values(batch[0], 2)
     with pytest.raises(TaskError, match="has shape"):
         agent.act(batch[0, 0], "asterix")
 
@@ -120,8 +125,39 @@ def test_protocol_is_said_in_words() -> None:
         assert part in text
 
 
+OLD_PROTOCOL = {
+    "episodes": 30, "epsilon": 0.05, "seed": 1, "num_envs": 8, "sticky_action_probability": 0.25,
+    "fire_on_reset": False, "noop_max": 7, "frame_skip": 3, "max_episode_frames": 5000,
+    "score": "raw return, unclipped",
+}  # fmt: skip
+"""As version 0.1.0 stored it, for every suite."""
+
+
+@pytest.mark.parametrize("suite", SUITE_DEFAULTS)
+def test_a_stored_protocol_of_any_version_says_the_same_as_the_config(suite: str) -> None:
+    tasks = TasksConfig(
+        suite=suite,
+        sticky_action_probability=0.25,
+        fire_on_reset=False,
+        noop_max=7,
+        frame_skip=3,
+        max_episode_frames=5000,
+    )
+    protocol = EvaluationProtocol.of(EvaluationConfig(episodes=30, epsilon=0.05, seed=1, num_envs=8), tasks)
+    assert EvaluationProtocol.from_dict(OLD_PROTOCOL | {"suite": suite}) == protocol
+    assert EvaluationProtocol.from_dict(json.loads(json.dumps(asdict(protocol)))) == protocol
+
+
+def test_a_protocol_lists_only_what_its_suite_knows() -> None:
+    gym = EvaluationProtocol.of(EvaluationConfig(), TasksConfig(suite="gym", names=("CartPole-v1",)))
+    assert gym.environment == ()
+    assert "sticky" not in str(gym)
+    minatar = EvaluationProtocol.of(EvaluationConfig(), TasksConfig(suite="minatar", names=("breakout",)))
+    assert minatar.environment == ("sticky actions 0", "frame cap 108,000")
+
+
 def test_published_rows_are_the_papers() -> None:
-    rows = {(policy, task): mean for policy, task, mean in published_rows(["pong", "breakout", "enduro"])}
+    rows = {(policy, task): mean for policy, task, mean in published_rows(AtariSuite, ["pong", "breakout", "enduro"])}
     assert rows["SwitchMT (paper)", "breakout"] == 5.6
     assert rows["MTSpark_ADD (paper)", "enduro"] == 371.2
     assert rows["human (Wang 2016)", "pong"] == 14.6

@@ -13,7 +13,7 @@ from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.spiking.normalization import TaskBatchNorm
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 
 STACKED = {"frame_stack": 4}
 VARIANTS: dict[str, dict[str, Any]] = {

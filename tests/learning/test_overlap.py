@@ -14,8 +14,8 @@ from switchmt_snn.config import resolve
 from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.training import Training
-from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play
+from switchmt_snn.tasks.registry import make_suite
 
 
 class Lazily:

@@ -220,7 +220,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(
     from switchmt_snn.errors import CheckpointError
     from switchmt_snn.learning.training import Training
     from switchmt_snn.runs.checkpoint import CheckpointStore
-    from switchmt_snn.tasks.make import make_suite
+    from switchmt_snn.tasks.registry import make_suite
 
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)

@@ -11,8 +11,8 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import TaskError
-from switchmt_snn.tasks.make import make_suite
 from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.registry import make_suite
 from tests.conftest import CountingEnvironment, vector_suite
 
 gymnasium.register_envs(ale_py)

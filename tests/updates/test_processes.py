@@ -12,7 +12,7 @@ import torch
 
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.training import make_learner
-from switchmt_snn.tasks.make import make_suite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.updates import choice as machine
 from tests.conftest import small_config
 from tests.runs.test_resume import CONFIG, content

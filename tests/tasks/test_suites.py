@@ -1,0 +1,182 @@
+"""Every registered suite: its facts agree with its environments; suites and tasks that are wrong are named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import torch
+
+from switchmt_snn.config import ExperimentConfig, SuiteDefaults, TasksConfig, resolve
+from switchmt_snn.config.suites import SUITE_DEFAULTS
+from switchmt_snn.errors import ConfigError, TaskError
+from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.runs.folder import describe_environment
+from switchmt_snn.spiking.network import build_network
+from switchmt_snn.tasks.check import check_suite
+from switchmt_snn.tasks.registry import SUITES, find_suite, make_suite, register_suite, suite_of
+from switchmt_snn.tasks.suite import Suite, TaskSuite
+from tests.conftest import CountingEnvironment, vector_suite
+
+NAMES = tuple(SUITES)
+
+
+def example(name: str) -> TasksConfig:
+    return TasksConfig(suite=name, names=SUITES[name].examples)
+
+
+def test_the_config_knows_every_suite_and_its_defaults() -> None:
+    assert {name: suite.defaults for name, suite in SUITES.items()} == SUITE_DEFAULTS
+    assert [suite.name for suite in SUITES.values()] == list(SUITES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_environments_do_what_their_suite_says(name: str) -> None:
+    """Shape, type and range of frames, valid actions, and the same episode for the same seed and actions."""
+    tasks = make_suite(example(name))
+    assert len(tasks.names) >= 2
+    check_suite(tasks, 60)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_open_config_becomes_a_network_for_the_suites_observations(name: str) -> None:
+    config = resolve(ExperimentConfig(tasks=example(name)))
+    assert config.tasks.frame_stack == SUITES[name].defaults.frame_stack
+    assert config.network.trunk == SUITES[name].defaults.trunk
+    tasks = make_suite(config.tasks)
+    build_network(config.network, observation_spec(tasks), 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_facts_name_what_exists(name: str) -> None:
+    suite = suite_of(example(name))
+    known = set(suite.known_tasks())
+    assert set(suite.examples) <= known
+    assert set(suite.references) <= known
+    for row in suite.published:
+        assert set(row.scores) <= known
+        assert row.source
+        assert all(map(math.isfinite, row.scores.values()))
+    for reference in suite.references.values():
+        assert reference.human != reference.random
+        assert reference.source
+    assert all(path.is_file() for path in suite.files.values())
+    assert all(version(package) for package in suite.packages)
+    assert all(word.isprintable() and "," not in word.replace(",000", "") for word in suite.protocol)
+    rate = suite.decisions_per_s
+    assert rate is None or rate * suite.frame_skip == suite.frames_per_s
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_stores_the_suites_versions_and_files(name: str) -> None:
+    facts = describe_environment(ExperimentConfig(tasks=example(name)), torch.device("cpu"))
+    assert set(SUITES[name].packages) <= set(facts["versions"])
+    assert set(facts["files_sha256"]) == set(suite_of(example(name)).files)
+
+
+class Counting(Suite):
+    """Tasks that count steps."""
+
+    name = "counting"
+    defaults = SuiteDefaults(frame_stack=2, trunk="mlp")
+    examples = ("a", "b")
+
+    def make(self) -> TaskSuite:
+        tasks = vector_suite(lambda task, n: CountingEnvironment(task, n, 5), 4, len(self.config.names), stack=2)
+        return replace(tasks, names=self.config.names)
+
+
+@pytest.fixture
+def counting() -> Iterator[type[Suite]]:
+    register_suite(Counting)
+    yield Counting
+    del SUITES["counting"], SUITE_DEFAULTS["counting"]
+
+
+def test_a_registered_suite_is_stored_by_the_name_of_its_class(counting: type[Suite]) -> None:
+    config = resolve(ExperimentConfig(tasks=TasksConfig(suite="counting", names=("a", "b"))))
+    assert config.tasks.suite == "tests.tasks.test_suites:Counting"
+    assert (config.tasks.frame_stack, config.network.trunk) == (2, "mlp")
+    assert find_suite(config.tasks.suite) is counting
+    assert resolve(config) == config
+    assert set(suite_of(config.tasks).files) == {"tests.tasks.test_suites"}
+    check_suite(make_suite(config.tasks), 20)
+
+
+def test_a_suite_is_found_by_the_name_of_its_class_without_being_registered() -> None:
+    config = TasksConfig(suite="tests.tasks.test_suites:Counting", names=("x",))
+    assert make_suite(config).names == ("x",)
+
+
+def test_a_registered_suite_may_be_registered_again_but_not_take_anothers_name(counting: type[Suite]) -> None:
+    assert register_suite(Counting) is Counting
+    with pytest.raises(ConfigError, match="has the name 'atari', expected a free short name"):
+        register_suite(TakesAtari)
+
+
+class TakesAtari(Counting):
+    """A name that is not free."""
+
+    name = "atari"
+
+
+class Nameless(Suite):
+    """States nothing."""
+
+
+def test_incomplete_suites_are_named() -> None:
+    with pytest.raises(ConfigError, match="the suite 'Nameless' states no name"):
+        register_suite(Nameless)
+    with pytest.raises(ConfigError, match=r"expected a subclass of switchmt_snn.tasks.suite.Suite"):
+        register_suite(dict)  # type: ignore[type-var]
+    with pytest.raises(ConfigError, match=r"expected a class with defaults = SuiteDefaults\(\.\.\.\)"):
+        ExperimentConfig(tasks=TasksConfig(suite="tests.tasks.test_suites:Nameless", names=("a",)))
+
+
+@pytest.mark.parametrize("name", ["atary", "", "mujoco", 3])
+def test_an_unknown_suite_is_refused_and_the_known_ones_are_named(name: object) -> None:
+    with pytest.raises(ConfigError, match=r"expected atari, minatar, gym, or a class as package.module:Name"):
+        TasksConfig(suite=name)  # type: ignore[arg-type]
+
+
+def test_a_suite_that_makes_other_tasks_than_asked_is_named(counting: type[Suite], monkeypatch) -> None:
+    good = counting(TasksConfig(suite="counting", names=("a", "b"))).make()
+    wrong = (
+        (replace(good, names=("a", "c")), "names"),
+        (replace(good, frame_stack=3), "frame_stack 3, expected 2"),
+        (replace(good, frame_shape=(2, 2)), "frame_shape"),
+        (replace(good, frame_dtype=np.float64), "uint8 or float32"),
+        (replace(good, valid_actions_KA=np.zeros((2, 2), np.bool_)), "at least one action"),
+    )
+    for tasks, message in wrong:
+        monkeypatch.setattr(Counting, "make", lambda self, tasks=tasks: tasks)
+        with pytest.raises(TaskError, match=message):
+            make_suite(TasksConfig(suite="counting", names=("a", "b")))
+
+
+class Forgetful(CountingEnvironment):
+    """Counts its resets, so that no episode comes again."""
+
+    resets = 0
+
+    def reset(self, env_ids, seeds):  # type: ignore[no-untyped-def]
+        Forgetful.resets += 1
+        return super().reset(env_ids, seeds + Forgetful.resets)
+
+
+def test_check_suite_names_what_an_environment_does_wrong() -> None:
+    good = vector_suite(lambda task, n: CountingEnvironment(task, n, 5), 4)
+    check_suite(good, 20)
+    wrong = (
+        (replace(good, frame_shape=(5,)), "frames of shape"),
+        (replace(good, frame_dtype=np.uint8), "type float32, expected"),
+        (replace(good, in_unit_range=True), "expected values from 0 to 1"),
+        (replace(good, make=lambda task, n: Forgetful(task, n, 5)), "differs at step 0 when it is played again"),
+    )
+    for tasks, message in wrong:
+        with pytest.raises(TaskError, match=message):
+            check_suite(tasks, 20)
