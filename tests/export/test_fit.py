@@ -22,41 +22,21 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.chips.fit import ChipFit, check_fit, layer_shapes
 from switchmt_snn.export.chips.limits import CHIPS, SPECK_CORES_KI, LayerShape, assign_cores, speck_memory_ki
 from switchmt_snn.export.folding import fold
+from tests.export.chip_networks import ATARI, BUILT_IN, CONVOLUTIONS, GOLDEN, chain, conv, golden_fits, linear
 from tests.export.export_cases import make_agent
-
-
-def conv(name: str, shape: tuple[int, int, int], units: int, kernel: int, stride: int = 1) -> LayerShape:
-    sides = [(side - kernel) // stride + 1 for side in shape[1:]]
-    return LayerShape(name, shape, (units, *sides), kernel, stride, units * shape[0] * kernel**2, True)
-
-
-def linear(name: str, inputs: int | tuple[int, ...], units: int) -> LayerShape:
-    image = inputs if isinstance(inputs, tuple) else None
-    count = math.prod(inputs) if isinstance(inputs, tuple) else inputs
-    return LayerShape(name, (count,), (units,), None, 1, units * count, True, image)
-
-
-def chain(inputs: int | tuple[int, ...], *units: int) -> list[LayerShape]:
-    """Linear layers one after another."""
-    return [linear(f"linear{i}", n, m) for i, (n, m) in enumerate(itertools.pairwise((inputs, *units)))]
-
-
-CONVOLUTIONS = [
-    conv("conv1", (4, 84, 84), 32, 8, 4),
-    conv("conv2", (32, 20, 20), 64, 4, 2),
-    conv("conv3", (64, 9, 9), 64, 3),
-]
-ATARI = [
-    *CONVOLUTIONS,
-    linear("hidden/value", (64, 7, 7), 512),
-    linear("hidden/advantage", (64, 7, 7), 512),
-    linear("head", 1024, 18),
-]
 
 
 def limits(fit: ChipFit, layer: str) -> dict[str, tuple[float, float]]:
     found = next(part for part in fit.layers if part.layer == layer)
     return {limit.resource: (limit.needs, limit.has) for limit in found.limits}
+
+
+def test_built_in_chips_answer_as_stored() -> None:
+    """Bit for bit what was answered when chips were still written in Python."""
+    stored, now = json.loads(GOLDEN.read_text()), json.loads(json.dumps(golden_fits()))
+    assert list(now) == list(stored)
+    for name, fit in stored.items():
+        assert now[name] == fit, name
 
 
 def test_the_papers_network_on_speck() -> None:
@@ -274,7 +254,7 @@ def test_inputs_that_are_no_spikes_need_a_host() -> None:
 
 
 def test_every_chip_has_its_source_and_says_what_it_leaves_out() -> None:
-    assert set(CHIPS) == {"speck", "loihi-1", "loihi-2", "spinnaker2", "xylo-audio-2", "xylo-audio-3"}
+    assert set(CHIPS) == set(BUILT_IN)
     for name, chip in CHIPS.items():
         assert (chip.name, bool(chip.source), len(chip.notes) > 1) == (name, True, True)
     with pytest.raises(ConfigError, match="unknown chip 'loihi1'; did you mean 'loihi-1'"):
