@@ -8,7 +8,7 @@ import itertools
 import json
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,17 @@ import torch
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ConfigError, ExportError
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
-from switchmt_snn.export.chips.limits import CHIPS
 from switchmt_snn.export.chips.precision import effect_of_precision
 from switchmt_snn.export.counts.network import TaskCounter, TaskProfile
 from switchmt_snn.export.counts.nir_file import profile_nir
-from switchmt_snn.export.energy.estimate import Energy, Target, builtin_targets, estimate, load_target
+from switchmt_snn.export.energy.estimate import Energy, Target, estimate
 from switchmt_snn.export.energy.traffic import ann_traffic, traffic
 from switchmt_snn.export.folding import fold
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
+from switchmt_snn.export.selection import Selection
 from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.runs.folder import RunFolder, command_line, latest_run
 from switchmt_snn.runs.run import load_agent
@@ -57,46 +57,12 @@ class Profile:
     frames: Frames
 
 
-@dataclass(frozen=True)
-class Selection:
-    """What to price and what to fit: energy targets and chips."""
-
-    targets: tuple[Target, ...]
-    chips: tuple[str, ...]
-
-    @classmethod
-    def of(cls, names: tuple[str, ...]) -> Selection:
-        """Built-in targets, chips and YAML files by name; none names all built-in ones.
-
-        Raises:
-            ConfigError: no such target or chip, or a file that is not a target.
-        """
-        known = builtin_targets()
-        if not names:
-            return cls(tuple(known.values()), tuple(CHIPS))
-        names = tuple(dict.fromkeys(names))
-        for name in names:
-            if name not in (*known, *CHIPS) and Path(name).suffix not in (".yaml", ".yml"):
-                raise ConfigError(
-                    f"unknown target {name!r}, expected a YAML file, an energy target ({', '.join(known)}) or a chip "
-                    f"({', '.join(CHIPS)})"
-                )
-        targets = [load_target(name) for name in names if name in known or name not in CHIPS]
-        taken = {target.name for target in targets}
-        if len(taken) < len(targets):
-            raise ConfigError(
-                f"two targets have one name ({', '.join(target.name for target in targets)}), expected different ones; "
-                "change the name in your file"
-            )
-        return cls(tuple(targets), tuple(name for name in names if name in CHIPS))
-
-
 def profile(
     run: str | Path | None = None,
     decisions: int = 1000,
     checkpoint: str = "last",
     out: str | Path | None = None,
-    targets: tuple[str, ...] = (),
+    targets: Sequence[str | Path] = (),
 ) -> Profile:
     """Count what a run's network does on recorded decisions of each task; write JSON, CSV and an HTML report.
 
@@ -105,10 +71,10 @@ def profile(
         decisions: recorded decisions per task, rounded up to a multiple of the copies that are recorded.
         checkpoint: ``last`` or ``best``.
         out: where; None takes the run's ``profile/`` folder.
-        targets: names of built-in targets or chips, or YAML files; empty takes all built-in ones.
+        targets: names of built-in energy targets or chips, or YAML files of either; empty takes all built-in ones.
 
     Raises:
-        ConfigError: fewer than one decision, or a target that is not one.
+        ConfigError: fewer than one decision, or a target or chip that does not exist or is wrong.
         ExportError: recorded play that cannot be read or does not fit, or a weight that is not finite.
     """
     if not 1 <= decisions <= MAX_DECISIONS:
@@ -154,7 +120,7 @@ def profile(
 
 
 def profile_file(
-    file: str | Path, observations: str | Path, out: str | Path | None = None, targets: tuple[str, ...] = ()
+    file: str | Path, observations: str | Path, out: str | Path | None = None, targets: Sequence[str | Path] = ()
 ) -> Profile:
     """:func:`profile` of a NIR file on stored observations (:func:`switchmt_snn.export.counts.nir_file.profile_nir`).
 
@@ -170,10 +136,8 @@ def profile_file(
     """
     selection, path = Selection.of(targets), Path(file)
     if targets and selection.chips:
-        raise ConfigError(
-            f"{', '.join(selection.chips)} is a chip, expected energy targets for a NIR file; chips are checked for "
-            "runs"
-        )
+        names = ", ".join(chip.name for chip in selection.chips)
+        raise ConfigError(f"{names} is a chip, expected energy targets for a NIR file; chips are checked for runs")
     counted = profile_nir(path, Path(observations))
     folder = _folder(Path(out) if out is not None else path.with_name(f"{path.stem}-profile"))
     facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps, "chips": [], "decisions_per_s": None}

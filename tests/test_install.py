@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 CHECK = """
 import importlib.resources as r, sys
 from pathlib import Path
-import switchmt_snn, switchmt_snn.export, switchmt_snn.export.chips.limits
+import switchmt_snn, switchmt_snn.export, switchmt_snn.export.chips.fit
 import switchmt_snn.native.library as native
 from switchmt_snn.config import load_config
 expected = sys.argv[1]
@@ -26,6 +26,7 @@ assert switchmt_snn.export.__file__.startswith(expected), switchmt_snn.export.__
 assert load_config("paper").name == "paper"
 assert (Path(native.__file__).parent / "csrc" / "numbers.h").is_file()
 assert any(path.name == "loihi-2018.yaml" for path in r.files("switchmt_snn.export.energy.targets").iterdir())
+assert any(path.name == "speck.yaml" for path in r.files("switchmt_snn.export.chips.builtin").iterdir())
 templates = r.files("switchmt_snn.export.report").joinpath("templates")
 assert any(path.name.endswith(".jinja") for path in templates.iterdir())
 """

@@ -1,7 +1,7 @@
-"""Will it fit on the chip? Every layer against the limits that are public, with what the check leaves out.
+"""Will it fit on the chip? Every layer against the chip's public limits, with what the check leaves out.
 
-A "no" names what is short and, where there is one, the largest layer that fits, found by the same check. A "yes" is as
-good as what is counted: read :attr:`ChipFit.conditions`.
+A "no" names what is short and, if one exists, the largest layer that fits, found by the same check. A "yes" is as good
+as what is counted: read :attr:`ChipFit.conditions`.
 """
 
 from __future__ import annotations
@@ -12,25 +12,36 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from switchmt_snn.errors import ConfigError, did_you_mean
-from switchmt_snn.export.chips.limits import CHIPS, ONE_TASK, WEIGHT_BITS, Chip, LayerShape, Limit
+from switchmt_snn.errors import ExportError
+from switchmt_snn.export.chips.chip import Chip
+from switchmt_snn.export.chips.chip_file import load_chip
+from switchmt_snn.export.chips.limits import Limit
+from switchmt_snn.export.chips.shapes import LayerShape
 from switchmt_snn.export.folding import FoldedNetwork
+
+ONE_TASK = "one task at a time: gains and BatchNorm are in the weights, and another task means loading others"
 
 
 @dataclass(frozen=True)
 class LayerFit:
-    """One layer, as if it had the chip for itself: its limits, the cores it takes at least, and, where it does not
-    fit, the change with which it would (checked) or what forbids every size."""
+    """One layer, as if it had the chip for itself.
+
+    Attributes:
+        cores: number of cores that it takes, at least.
+        not_held: kind of layer or of neurons that the chip does not have; empty if it has both.
+        change: if it does not fit: the change with which it would (checked), or what forbids every size.
+    """
 
     layer: str
     limits: tuple[Limit, ...]
     cores: int
+    not_held: str
     change: str
 
     @property
     def fits(self) -> bool:
-        """Whether every resource suffices."""
-        return all(limit.fits for limit in self.limits)
+        """Whether the chip has its kinds, and enough of every resource."""
+        return not self.not_held and all(limit.fits for limit in self.limits)
 
     @property
     def limiting(self) -> Limit:
@@ -49,9 +60,10 @@ class ChipFit:
 
     Attributes:
         limits: of the whole chip.
-        conditions: what must hold besides, and what is not counted.
-        host: layers that see numbers, which the chip does not take; counted all the same.
-        change: where it does not fit: the number of hidden units with which everything does, checked; or nothing.
+        conditions: what else must be true, and what is not counted.
+        host: layers that see dense values although the chip takes spikes only; their resources are counted, too.
+        change: if it does not fit: the number of hidden units with which everything does (checked); empty if no
+            number does.
     """
 
     chip: str
@@ -83,20 +95,32 @@ class ChipFit:
 
 
 def layer_shapes(network: FoldedNetwork) -> tuple[LayerShape, ...]:
-    """Shapes of all layers, the head last; the two streams of a dueling network are layers of their own."""
-    sees_spikes, shapes = network.sees_spikes, []
-    sees = network.encoded_shape
+    """Shapes of all layers, the head last; the two streams of a dueling network are layers of their own.
+
+    This is the only function of this package that reads a network's description for its shapes.
+
+    Raises:
+        ExportError: a kernel is not square.
+    """
+    shapes: list[LayerShape] = []
+    sees_spikes, sees = network.sees_spikes, network.encoded_shape
     for layer in network.layers:
+        kernel = layer.weight.shape[2:] if layer.is_convolution else None
+        if kernel is not None and kernel[0] != kernel[1]:
+            raise ExportError(
+                f"{layer.name} has a kernel of {kernel[0]} x {kernel[1]}, expected a square one for chips"
+            )
         streams = ("/value", "/advantage") if layer.groups == 2 else ("",)
         shapes += [
             LayerShape(
                 name=layer.name + stream,
                 input_shape=layer.input_shape,
                 output_shape=(layer.output_shape[0] // len(streams), *layer.output_shape[1:]),
-                kernel=layer.weight.shape[2] if layer.is_convolution else None,
+                kernel=None if kernel is None else kernel[0],
                 stride=layer.stride or 1,
                 weights=layer.weight.size // len(streams),
                 spiking_input=sees_spikes,
+                neuron=None if layer.neurons is None else layer.neurons.kind,
                 input_image=sees if len(sees) == 3 else None,
             )
             for stream in streams
@@ -105,25 +129,41 @@ def layer_shapes(network: FoldedNetwork) -> tuple[LayerShape, ...]:
     return tuple(shapes)
 
 
-def check_fit(layers: Sequence[LayerShape], chip: str) -> ChipFit:
-    """Check a network, as :func:`layer_shapes` gives it, against the chip of that name in :data:`CHIPS`.
+def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
+    """Check a network, as :func:`layer_shapes` gives it, against a chip.
+
+    Args:
+        layers: in forward order, the head last.
+        chip: a chip, the name of a built-in one, or a YAML file.
 
     Raises:
-        ConfigError: no such chip.
+        ConfigError: no such chip, or a file that is not one.
     """
-    if chip not in CHIPS:
-        raise ConfigError(f"unknown chip {chip!r}{did_you_mean(chip, CHIPS)}")
-    on = CHIPS[chip]
+    on = chip if isinstance(chip, Chip) else load_chip(chip)
     fits = [
-        LayerFit(layer.name, tuple(on.layer_limits(layers, index)), on.cores(layer), _layer_change(on, layers, index))
+        LayerFit(
+            layer=layer.name,
+            limits=tuple(on.layer_limits(layers, index)),
+            cores=on.cores(layer),
+            not_held=on.not_held(layer),
+            change=_layer_change(on, layers, index),
+        )
         for index, layer in enumerate(layers)
     ]
-    host = tuple(layer.name for layer in layers if not layer.spiking_input and not on.takes_values)
+    host = tuple(layer.name for layer in layers if not layer.spiking_input and on.takes == "spikes")
     spikes_in = f"takes spikes only: a host must compute {', '.join(host)} (counted all the same) and send spikes"
     conditions = (*([spikes_in] if host else []), ONE_TASK, *on.notes)
     whole = tuple(on.chip_limits(layers))
     return ChipFit(
-        on.name, on.title, on.source, tuple(fits), whole, conditions, host, WEIGHT_BITS, _chip_change(on, layers)
+        chip=on.name,
+        title=on.title,
+        source=on.source,
+        layers=tuple(fits),
+        limits=whole,
+        conditions=conditions,
+        host=host,
+        weight_bits=on.widths.weight_bits,
+        change=_chip_change(on, layers),
     )
 
 
@@ -132,7 +172,9 @@ def _short(chip: Chip, layers: Sequence[LayerShape], index: int) -> list[Limit]:
 
 
 def _layer_change(chip: Chip, layers: Sequence[LayerShape], index: int) -> str:
-    """The largest number of units with which a layer that does not fit would, on the same inputs."""
+    """What the chip does not have, or the largest number of units that fits on the same inputs; empty if it fits."""
+    if not_held := chip.not_held(layers[index]):
+        return f"not held: {not_held}"
 
     def short(units: int) -> list[Limit]:
         return _short(chip, (*layers[:index], layers[index].resized(units), *layers[index + 1 :]), index)
@@ -145,14 +187,14 @@ def _layer_change(chip: Chip, layers: Sequence[LayerShape], index: int) -> str:
 
 
 def _chip_change(chip: Chip, layers: Sequence[LayerShape]) -> str:
-    """The largest number of hidden units with which a network that does not fit would."""
+    """The largest number of hidden units with which a network that does not fit would; empty if there is none."""
     units = max((layer.units for layer in layers[:-1] if layer.kernel is None), default=0)
     most = 0 if _fits(chip, layers) else _largest(units, lambda fewer: _fits(chip, _with_hidden_units(layers, fewer)))
     return f"everything fits with network.hidden_units of at most {most:,} (checked)" if most else ""
 
 
 def _fits(chip: Chip, layers: Sequence[LayerShape]) -> bool:
-    alone = not any(_short(chip, layers, index) for index in range(len(layers)))
+    alone = not any(chip.not_held(layer) or _short(chip, layers, index) for index, layer in enumerate(layers))
     return alone and all(limit.fits for limit in chip.chip_limits(layers))
 
 

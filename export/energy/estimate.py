@@ -1,21 +1,20 @@
-"""Energy from counts and sourced constants: several profiles of the same chip, never one number.
+"""Energy from counts and constants with a source: several targets for the same chip, never one number.
 
-A target is a YAML file in ``export/targets/`` or of one's own. What a target has no price for is not guessed: its count
-is reported as not included.
+A target is a YAML file in ``export/energy/targets/`` or of one's own. An operation without a price is not guessed: its
+count is reported as not included.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from importlib import resources
+from functools import cache
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from switchmt_snn.errors import ConfigError, did_you_mean
 from switchmt_snn.export.counts.network import LayerProfile, TaskProfile
 from switchmt_snn.export.energy.traffic import Traffic, ann_traffic, traffic
+from switchmt_snn.export.yaml_files import SUFFIXES, Section, builtin_files, check_number, file_text, parse
 
 UNITS_PJ = {"fJ": 1e-3, "pJ": 1.0, "nJ": 1e3}
 EVIDENCE = ("measured", "simulated", "estimated", "reported")
@@ -212,98 +211,53 @@ def _memory_pj(accesses: Traffic, layer: LayerProfile, memory: Memory) -> dict[s
     }
 
 
+@cache
 def builtin_targets() -> dict[str, Target]:
     """The targets that come with the package, by name."""
-    files = sorted(
-        (
-            path
-            for path in resources.files("switchmt_snn.export.energy.targets").iterdir()
-            if path.name.endswith(".yaml")
-        ),
-        key=lambda path: path.name,
-    )
-    targets = [read_target(path.read_text(encoding="utf-8"), path.name) for path in files]
+    files = builtin_files("switchmt_snn.export.energy.targets")
+    targets = [read_target(parse(text, name), name) for name, text in files.items()]
     return {target.name: target for target in targets}
 
 
-def load_target(name_or_file: str) -> Target:
+def load_target(name_or_file: str | Path) -> Target:
     """A built-in target by name, or one from a YAML file.
 
     Raises:
         ConfigError: no such target, or a file that is not one.
     """
-    path = Path(name_or_file)
-    if path.suffix in (".yaml", ".yml"):
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-            raise ConfigError(f"target {name_or_file} cannot be read ({reason}), expected a YAML file") from error
-        return read_target(text, name_or_file)
-    known = builtin_targets()
-    if name_or_file not in known:
-        raise ConfigError(f"unknown target {name_or_file!r}{did_you_mean(name_or_file, known)}")
-    return known[name_or_file]
+    if Path(name_or_file).suffix in SUFFIXES:
+        return read_target(parse(file_text(name_or_file), str(name_or_file)), str(name_or_file))
+    known, name = builtin_targets(), str(name_or_file)
+    if name not in known:
+        raise ConfigError(f"unknown target {name!r}{did_you_mean(name, known)}")
+    return known[name]
 
 
-def read_target(text: str, where: str) -> Target:
-    """Read and check a target.
+def read_target(raw: Any, where: str) -> Target:
+    """A target from the keys and values of its file.
 
     Raises:
         ConfigError: a key is missing or unknown, a text is empty, a constant is negative, or a unit is not known.
     """
-    try:
-        raw = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} is not YAML ({str(error).splitlines()[0]}), expected a target") from error
-    _keys(where, "", raw, (*_TEXTS, "evidence", "unit", "operations"), ("memory",))
-    for key in _TEXTS:
-        if not isinstance(raw[key], str) or not raw[key].strip():
-            raise ConfigError(f"{where}: {key} is {raw[key]!r}, expected a text; every constant needs its origin")
-    if not isinstance(raw["evidence"], str) or raw["evidence"] not in EVIDENCE:
-        raise ConfigError(f"{where}: evidence is {raw['evidence']!r}, expected one of {', '.join(EVIDENCE)}")
-    if not isinstance(raw["unit"], str) or raw["unit"] not in UNITS_PJ:
-        raise ConfigError(f"{where}: unit is {raw['unit']!r}, expected one of {', '.join(UNITS_PJ)}")
-    factor = UNITS_PJ[raw["unit"]]
-    _keys(where, "operations.", raw["operations"], ("ac",), _OPERATIONS)
-    operations = {k: _number(where, f"operations.{k}", v) * factor for k, v in raw["operations"].items()}
-    memory = None
-    if raw.get("memory") is not None:
-        _keys(where, "memory.", raw["memory"], _MEMORY, ())
-        levels = raw["memory"]["energy_by_kilobytes"]
-        if not isinstance(levels, dict) or not levels:
-            raise ConfigError(f"{where}: memory.energy_by_kilobytes is {levels!r}, expected sizes and energies")
-        priced = {
-            _number(where, "a size", size): _number(where, f"memory of {size} kB", pj) * factor
-            for size, pj in levels.items()
-        }
-        bits = {k: _whole(where, f"memory.{k}", raw["memory"][k]) for k in _MEMORY if k.endswith("_bits")}
-        memory = Memory(bits["access_bits"], dict(sorted(priced.items())), bits["weight_bits"], bits["state_bits"])
-    texts = {key: raw[key] for key in _TEXTS}
-    return Target(**texts, evidence=raw["evidence"], operations_pj=operations, memory=memory)
+    file = Section(where, raw, "", (*_TEXTS, "evidence", "unit", "operations"), ("kind", "memory"))
+    if "kind" in file:
+        file.choice("kind", ("energy",))
+    texts = {key: file.text(key, "; every constant needs its origin") for key in _TEXTS}
+    evidence = file.choice("evidence", EVIDENCE)
+    factor = UNITS_PJ[file.choice("unit", tuple(UNITS_PJ))]
+    prices = file.section("operations", ("ac",), _OPERATIONS)
+    operations = {name: prices.number(name) * factor for name in prices.raw}
+    memory = _memory(file.section("memory", _MEMORY), factor) if "memory" in file else None
+    return Target(**texts, evidence=evidence, operations_pj=operations, memory=memory)
 
 
-def _keys(where: str, prefix: str, raw: Any, needed: tuple[str, ...], allowed: tuple[str, ...]) -> None:
-    if not isinstance(raw, dict):
-        raise ConfigError(f"{where}: {prefix.rstrip('.') or 'the file'} is {raw!r:.60}, expected keys and values")
-    for key in needed:
-        if key not in raw:
-            raise ConfigError(f"{where} has no {prefix}{key}, expected one; see the files in export/targets")
-    for key in raw:
-        if key not in (*needed, *allowed):
-            hint = did_you_mean(str(key), (*needed, *allowed))
-            raise ConfigError(f"{where} has the unknown key {prefix}{key}{hint}")
-
-
-def _number(where: str, key: str, value: Any) -> float:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not 0 <= value < 1e18:  # NaN is not
-        hint = "; YAML reads 2e-3 as text: write 2.0e-3" if isinstance(value, str) else ""
-        raise ConfigError(f"{where}: {key} is {value!r:.60}, expected a number of at least 0{hint}")
-    return float(value)
-
-
-def _whole(where: str, key: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 1024:
-        raise ConfigError(f"{where}: {key} is {value!r:.60}, expected a whole number of bits, 1 to 1024")
-    return value
+def _memory(section: Section, factor: float) -> Memory:
+    levels = section.section("energy_by_kilobytes", optional=None)
+    if not levels.raw:
+        raise section.wrong("energy_by_kilobytes", "sizes and energies")
+    energies = {
+        float(check_number(levels.where, "a size of memory.energy_by_kilobytes", size)): levels.number(size) * factor
+        for size in levels.raw
+    }
+    bits = {key: section.whole(key, 1, 1024, "bits") for key in _MEMORY if key.endswith("_bits")}
+    return Memory(bits["access_bits"], dict(sorted(energies.items())), bits["weight_bits"], bits["state_bits"])

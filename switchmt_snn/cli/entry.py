@@ -99,7 +99,7 @@ class ProfileOptions:
     decisions: int = 1000
     """Recorded decisions per task."""
     target: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A built-in energy target, a chip, or a YAML file; may be given several times. Default: all built-in ones."""
+    """Energy target or chip: a built-in one by name, or a YAML file. May be repeated. Default: all built-in ones."""
     checkpoint: Literal["last", "best"] = "last"
     """Which weights."""
     observations: Path | None = None

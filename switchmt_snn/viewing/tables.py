@@ -162,6 +162,9 @@ def fit_table(profile: dict[str, Any]) -> Table:
         needs, has = (_three_digits(limit[key]) for key in ("needs", "has"))
         unit = "" if limit["unit"] == limit["resource"] else f" {limit['unit']},"
         amount = f"{needs} of {has}{unit} {limit['resource']}"
+        missing = [(layer["layer"], layer["not_held"]) for layer in chip["layers"] if layer["not_held"]]
+        if missing:
+            where, amount = missing[0][0], f"not held: {missing[0][1]}"
         table.add_row(chip["chip"], _yes(chip["fits"]), where, amount)
     return table
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
-from switchmt_snn.export.chips.limits import LayerShape
+from switchmt_snn.export.chips.shapes import LayerShape
 from switchmt_snn.export.folding import fold
 from tests.export.export_cases import make_agent
 
@@ -20,14 +19,14 @@ BUILT_IN = ("speck", "loihi-1", "loihi-2", "spinnaker2", "xylo-audio-2", "xylo-a
 def conv(name: str, shape: tuple[int, int, int], units: int, kernel: int, stride: int = 1) -> LayerShape:
     """A convolution without padding."""
     sides = [(side - kernel) // stride + 1 for side in shape[1:]]
-    return LayerShape(name, shape, (units, *sides), kernel, stride, units * shape[0] * kernel**2, True)
+    return LayerShape(name, shape, (units, *sides), kernel, stride, units * shape[0] * kernel**2, True, "IF")
 
 
 def linear(name: str, inputs: int | tuple[int, ...], units: int) -> LayerShape:
     """A dense layer on features or on an image."""
     image = inputs if isinstance(inputs, tuple) else None
     count = math.prod(inputs) if isinstance(inputs, tuple) else inputs
-    return LayerShape(name, (count,), (units,), None, 1, units * count, True, image)
+    return LayerShape(name, (count,), (units,), None, 1, units * count, True, "IF", image)
 
 
 def chain(inputs: int | tuple[int, ...], *units: int) -> list[LayerShape]:
@@ -80,9 +79,3 @@ def golden_fits() -> dict[str, dict[str, Any]]:
         for name, layers in golden_networks().items()
         for chip in BUILT_IN
     }
-
-
-if __name__ == "__main__":
-    # Only a commit that says why may write this file anew: python -m tests.export.chip_networks
-    rows = [f"{json.dumps(name)}: {json.dumps(fit)}" for name, fit in golden_fits().items()]
-    GOLDEN.write_text("{\n" + ",\n".join(rows) + "\n}\n")

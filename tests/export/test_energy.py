@@ -10,7 +10,8 @@ import yaml
 
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.counts.network import LayerProfile, TaskProfile
-from switchmt_snn.export.energy.estimate import Memory, builtin_targets, estimate, load_target, read_target
+from switchmt_snn.export.energy.estimate import Memory, Target, builtin_targets, estimate, load_target, read_target
+from switchmt_snn.export.yaml_files import parse
 from tests.export.test_export_command import call, run, trained  # noqa: F401
 
 TEXTS = dict.fromkeys(("name", "title", "chip", "process", "source", "includes", "leaves_out"), "x")
@@ -58,9 +59,13 @@ def make(**changes) -> str:
     return yaml.safe_dump({**TARGET, **changes})
 
 
+def target(text: str) -> Target:
+    return read_target(parse(text, "my.yaml"), "my.yaml")
+
+
 def test_by_hand() -> None:
     """40 MACs, 20 + 4 ACs and 24 updates per decision: 400 + 48 + 72; the twin multiplies 86 times."""
-    energy = estimate(TASK, read_target(make(), "t"))
+    energy = estimate(TASK, target(make()))
     assert energy.compute_pj == pytest.approx(400 + 48 + 72)
     assert (energy.memory_pj, energy.not_included) == (None, ())
     assert energy.ann_pj == pytest.approx(860)
@@ -72,7 +77,7 @@ def test_by_hand() -> None:
 
 
 def test_what_has_no_price_is_named_and_not_guessed() -> None:
-    energy = estimate(TASK, read_target(make(operations={"ac": 2.0, "ac_conv": 1.0, "spike": 5.0}, unit="nJ"), "t"))
+    energy = estimate(TASK, target(make(operations={"ac": 2.0, "ac_conv": 1.0, "spike": 5.0}, unit="nJ")))
     assert energy.compute_pj == pytest.approx(48e3 + 8 * 5e3)  # 24 accumulations, 6 + 2 spikes
     assert energy.not_included == (
         "40 multiplications of conv1",
@@ -83,7 +88,7 @@ def test_what_has_no_price_is_named_and_not_guessed() -> None:
 
 
 def test_a_part_of_the_network_is_not_compared_with_the_whole_twin() -> None:
-    energy = estimate(TASK, read_target(make(operations={"ac": 2.0, "mac": 10.0}), "t"))
+    energy = estimate(TASK, target(make(operations={"ac": 2.0, "mac": 10.0})))
     assert len(energy.not_included) == 2, "neuron updates have no price"
     assert energy.ann_pj == pytest.approx(860)
     assert (energy.by_ann, energy.by_quantised_ann) == (None, None)
@@ -95,7 +100,7 @@ def test_memory_is_read_for_every_operation() -> None:
     assert memory.access_pj(8 * 1024 + 1, 8) == pytest.approx(20 / 8)
     assert memory.access_pj(10**9, 8) == pytest.approx(100 / 8), "beyond the table: its largest"
     raw = {"access_bits": 64, "energy_by_kilobytes": {8: 10}, "weight_bits": 8, "state_bits": 16}
-    energy = estimate(TASK, read_target(make(memory=raw), "t"))
+    energy = estimate(TASK, target(make(memory=raw)))
     weight, state = 10 / 8, 10 / 4  # pJ per access of 8 and 16 bits
     # Per decision: a first convolution (40 operations, 8 neurons of 2 steps, 6 spikes), a hidden layer that 6 spikes
     # feed (20 operations, 4 neurons, 2 spikes), a head of 2 actions that 6 spikes feed (4 operations).
@@ -163,7 +168,7 @@ def test_built_in_targets_have_origin_and_price() -> None:
 )
 def test_wrong_targets_are_refused_in_one_line(changes: dict, message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        read_target(make(**changes), "my.yaml")
+        target(make(**changes))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -172,7 +177,7 @@ def test_a_missing_source_and_text_that_is_no_target(tmp_path: Path) -> None:
     without = {key: value for key, value in TARGET.items() if key != "source"}
     for text, message in ((yaml.safe_dump(without), "has no source"), ("[1, 2", "is not YAML"), ("7", "expected keys")):
         with pytest.raises(ConfigError, match=message):
-            read_target(text, "my.yaml")
+            target(text)
     with pytest.raises(ConfigError, match="unknown target 'loihi-2081'; did you mean 'loihi-2018'"):
         load_target("loihi-2081")
     with pytest.raises(ConfigError, match="cannot be read"):

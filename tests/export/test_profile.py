@@ -153,6 +153,25 @@ def test_chips_and_targets_are_chosen_by_name(run: Path, capsys: pytest.CaptureF
     assert "xylo-audio-3" in err, "all of them"
 
 
+def test_a_chip_of_ones_own_is_checked(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    """From the command line and from Python: a small copy of a built-in chip with weights of 4 bits."""
+    text = (Path(__file__).parents[2] / "export" / "chips" / "builtin" / "loihi-1.yaml").read_text()
+    text = text.replace("name: loihi-1", "name: my-chip").replace("cores: 128", "cores: 2")
+    (tmp_path / "my.yaml").write_text(text.replace("weight_bits: 8", "weight_bits: 4"))
+    out, _ = call(capsys, "profile", run, "--decisions", 20, "--target", tmp_path / "my.yaml", "--target", "speck")
+    assert "my-chip" in out
+    facts = profile(run, decisions=20, targets=[str(tmp_path / "my.yaml")]).facts
+    assert [(chip["chip"], chip["fits"], chip["weight_bits"]) for chip in facts["chips"]] == [("my-chip", False, 4)]
+    assert [effect["bits"] for effect in facts["tasks"][0]["precision"]] == [4]
+    (tmp_path / "my.yaml").write_text(text.replace("neurons: [IF, LIF, Synaptic]", "neurons: [LIF]"))
+    out, _ = call(capsys, "profile", run, "--decisions", 20, "--target", tmp_path / "my.yaml")
+    assert "not held: neuron kind IF" in " ".join(out.split())
+    (tmp_path / "my.yaml").write_text(text.replace("rule: fan_in", "rule: fan_inn"))
+    _, err = call(capsys, "profile", run, "--target", tmp_path / "my.yaml", code=2)
+    assert "did you mean 'fan_in'?" in err
+    assert len(err.strip().splitlines()) == 1
+
+
 def test_energy_per_episode_needs_an_evaluation_at_this_step(run: Path) -> None:  # noqa: F811
     (row,) = [
         row

@@ -1,0 +1,166 @@
+"""Strict reading of YAML files of facts (energy targets, chips): every mistake is one line that names file and key."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from switchmt_snn.errors import ConfigError, did_you_mean
+
+SUFFIXES = (".yaml", ".yml")
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """A key that is written twice is an error; YAML readers keep the last one silently."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.YAMLError(f"the key {key} is written twice")
+        return super().construct_mapping(node, deep)
+
+
+def builtin_files(package: str) -> dict[str, str]:
+    """Texts of the YAML files of a package, by file name, sorted."""
+    files = [entry for entry in resources.files(package).iterdir() if entry.name.endswith(SUFFIXES)]
+    return {entry.name: entry.read_text(encoding="utf-8") for entry in sorted(files, key=lambda entry: entry.name)}
+
+
+def file_text(path: str | Path) -> str:
+    """Text of a file.
+
+    Raises:
+        ConfigError: it cannot be read, or is not UTF-8.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ConfigError(f"target {path} cannot be read ({reason}), expected a YAML file") from error
+
+
+def parse(text: str, where: str) -> dict[str, Any]:
+    """The keys and values of a YAML text.
+
+    Raises:
+        ConfigError: it is not YAML, has a key twice, or holds no keys.
+    """
+    try:
+        raw = _UniqueKeys(text).get_single_data()
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{where} is not YAML ({reason}), expected an energy target or a chip") from error
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{where}: the file is {raw!r:.60}, expected keys and values")
+    return raw
+
+
+class Section:
+    """Keys and values of one mapping of a file. Every read checks the type and names the key in its error.
+
+    Args:
+        where: name of the file, for errors.
+        raw: the mapping.
+        prefix: path of the mapping in the file, ending in a dot; empty for the whole file.
+        needed, optional: all keys that the mapping may have; None takes any key (a mapping of names).
+
+    Raises:
+        ConfigError: ``raw`` is no mapping, or a key is unknown or missing.
+    """
+
+    def __init__(
+        self, where: str, raw: Any, prefix: str = "", needed: Sequence[str] = (), optional: Sequence[str] | None = ()
+    ) -> None:
+        if not isinstance(raw, dict):
+            raise ConfigError(f"{where}: {prefix.rstrip('.') or 'the file'} is {raw!r:.60}, expected keys and values")
+        self.where, self.raw, self._prefix = where, raw, prefix
+        known = (*needed, *(optional or ()))
+        for key in raw:
+            if optional is not None and key not in known:
+                raise ConfigError(f"{where} has the unknown key {prefix}{key}{did_you_mean(str(key), known)}")
+        for key in needed:
+            if key not in raw:
+                raise ConfigError(f"{where} has no {prefix}{key}, expected one; docs/energy.md lists all keys")
+
+    def __contains__(self, key: str) -> bool:
+        return self.raw.get(key) is not None
+
+    def name(self, key: str) -> str:
+        """Path of a key in the file."""
+        return f"{self._prefix}{key}"
+
+    def wrong(self, key: str, expected: str) -> ConfigError:
+        """The error of a value that is not what was expected."""
+        return ConfigError(f"{self.where}: {self.name(key)} is {self.raw[key]!r:.60}, expected {expected}")
+
+    def section(self, key: str, needed: Sequence[str] = (), optional: Sequence[str] | None = ()) -> Section:
+        """The mapping under a key; arguments as of the class."""
+        return Section(self.where, self.raw[key], f"{self.name(key)}.", needed, optional)
+
+    def sections(self, key: str, needed: Sequence[str], optional: Sequence[str] = ()) -> list[Section]:
+        """The mappings of a list with at least one."""
+        items = self.raw[key]
+        if not isinstance(items, list) or not items:
+            raise self.wrong(key, "a list with at least one entry")
+        return [Section(self.where, item, f"{self.name(key)}[{i}].", needed, optional) for i, item in enumerate(items)]
+
+    def text(self, key: str, why: str = "") -> str:
+        """A text that is not empty."""
+        value = self.raw[key]
+        if not isinstance(value, str) or not value.strip():
+            raise self.wrong(key, f"a text{why}")
+        return value
+
+    def choice(self, key: str, allowed: Sequence[str]) -> str:
+        """One of the allowed texts."""
+        value = self.raw[key]
+        if not isinstance(value, str) or value not in allowed:
+            hint = did_you_mean(value, allowed) if isinstance(value, str) else ""
+            raise self.wrong(key, f"one of {', '.join(allowed)}{hint if hint.startswith('; did') else ''}")
+        return value
+
+    def texts(self, key: str, allowed: Sequence[str] | None = None) -> tuple[str, ...]:
+        """A list of texts, at least one; all of them among the allowed ones, if these are given."""
+        items = self.raw[key]
+        if not isinstance(items, list) or not items or not all(isinstance(item, str) and item for item in items):
+            raise self.wrong(key, "a list of texts with at least one")
+        for item in items:
+            if allowed is not None and item not in allowed:
+                raise ConfigError(f"{self.where}: {self.name(key)} has {item!r}{did_you_mean(item, allowed)}")
+        return tuple(items)
+
+    def number(self, key: str) -> float:
+        """A number of at least 0, as it is written (a whole number stays one)."""
+        return check_number(self.where, self.name(key), self.raw[key])
+
+    def whole(self, key: str, low: int = 1, high: int = 10**15, of: str = "") -> int:
+        """A whole number between two bounds; ``of`` is its unit, for the error."""
+        value = self.raw[key]
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.wrong(key, f"a whole number{of and f' of {of}'}, {low} to {high:,}")
+        return value
+
+    def flag(self, key: str) -> bool:
+        """true or false."""
+        value = self.raw[key]
+        if not isinstance(value, bool):
+            raise self.wrong(key, "true or false")
+        return value
+
+
+def check_number(where: str, name: str, value: Any) -> float:
+    """The value, if it is a number of at least 0.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not 0 <= value < 1e18:  # NaN is not
+        hint = "; YAML reads 2e-3 as text: write 2.0e-3" if isinstance(value, str) else ""
+        raise ConfigError(f"{where}: {name} is {value!r:.60}, expected a number of at least 0{hint}")
+    return value  # type: ignore[no-any-return]
