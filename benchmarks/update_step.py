@@ -44,7 +44,7 @@ from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.native import library as native_library
-from switchmt_snn.native.products import spikes_as_bits
+from switchmt_snn.native.supports import spikes_as_bits
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite

@@ -6,23 +6,24 @@ Shapes: B batch, A actions, K tasks.
 from __future__ import annotations
 
 import copy
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.nn import Parameter
 
 from switchmt_snn.config import LearningConfig
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.state import Stateful
-from switchmt_snn.native.adam import NativeAdam
 from switchmt_snn.replay.on_device import to_device
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import QNetwork
-from switchmt_snn.updates.cuda_graph import DeviceBatch, GraphedStep, Step
-from switchmt_snn.updates.engine import NativeEvaluate, make_evaluate
-from switchmt_snn.updates.processes import COPY_TARGET, LOAD, STOP, UPDATE, ProcessGroup
+from switchmt_snn.updates.engine import engine_class
+from switchmt_snn.updates.protocol import DeviceBatch, EngineFactory
 
 
 def td_target(
@@ -42,19 +43,47 @@ def td_target(
     return rewards_B + discount * value_B.masked_fill(terminated_B, 0.0)
 
 
+LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"mse": F.mse_loss, "huber": F.huber_loss}
+"""Of Q(s, a) and target, by the name in ``learning.loss``."""
+
+CLIPS: dict[str, Callable[[list[Parameter], float], object]] = {
+    "none": lambda parameters, bound: None,
+    "value": torch.nn.utils.clip_grad_value_,
+    "norm": torch.nn.utils.clip_grad_norm_,
+}
+"""Change gradients in place, by the name in ``learning.gradient_clip``."""
+
+
 class Learner(Stateful):
-    """Owns the online network Q, the target network Q* and the optimiser.
+    """Owns the online network Q, the target network Q*, the optimizer and the engine.
 
     Q(s, a) is computed in training mode (batch statistics); the target and the choice of its action in eval mode, with
     the running statistics of the batch's task.
 
     Attributes:
-        updates: gradient steps made. They run as ``config.engine`` and ``config.precision`` say; acting is always eager
-            and in float32.
+        updates: gradient steps made. ``engine`` executes them; acting is always eager and in float32.
     """
 
-    SAVED = ("network", "target", "optimizer", "generator", "updates", "loss_sum", "q_sum", "summed")
-    DERIVED = ("config", "device", "_evaluate", "_group", "_invalid_KA", "_step", "_trained")
+    SAVED: ClassVar[tuple[str, ...]] = (
+        "network",
+        "target",
+        "optimizer",
+        "generator",
+        "updates",
+        "loss_sum",
+        "q_sum",
+        "summed",
+    )
+    DERIVED: ClassVar[tuple[str, ...]] = (
+        "config",
+        "device",
+        "engine",
+        "_clip",
+        "_invalid_KA",
+        "_loss",
+        "_step",
+        "_trained",
+    )
 
     def __init__(
         self,
@@ -63,7 +92,7 @@ class Learner(Stateful):
         valid_actions_KA: npt.NDArray[np.bool_],
         device: torch.device,
         seed: int,
-        group: ProcessGroup | None = None,
+        engine: EngineFactory | None = None,
     ) -> None:
         """Take a network over.
 
@@ -73,19 +102,22 @@ class Learner(Stateful):
             valid_actions_KA: which actions exist in which task.
             device: where to learn.
             seed: of the encoding's random numbers.
-            group: the processes among which updates are divided; None for one process.
+            engine: makes the engine; None takes the one that ``config.engine`` names.
+
+        Raises:
+            ConfigError: unknown loss, gradient clipping, engine or precision, or a network that the engine refuses.
         """
         self.config = config
         self.device = device
+        self._loss = _named(LOSSES, "learning.loss", config.loss)
+        self._clip = _named(CLIPS, "learning.gradient_clip", config.gradient_clip)
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
         self._trained = list(self.network.parameters())
-        precision = torch.bfloat16 if config.precision == "bfloat16" else None
-        self._group = group
-        self._evaluate = make_evaluate(self.network, self.target, config.engine, precision, config.double_q, group)
-        self.optimizer = self._make_optimizer()
+        self.engine = (engine or engine_class(config.engine))(self.network, self.target, config)
+        self.optimizer = self.engine.optimizer()
         self.generator = torch.Generator(device).manual_seed(seed)
-        self._step = self._make_step()
+        self._step = self.engine.executed(self._device_step, self.optimizer, self.generator)
         self.updates = 0
         self._invalid_KA = torch.as_tensor(~valid_actions_KA, device=device)
         self.loss_sum = torch.zeros((), device=device)
@@ -101,27 +133,7 @@ class Learner(Stateful):
             return q_BA.argmax(dim=1).cpu().numpy()  # type: ignore[no-any-return]
 
     def update(self, batch: Batch, task: int) -> None:
-        """One gradient step on a batch of one task; on several processes, called in the first one."""
-        if self._group is not None:
-            self._group.announce(UPDATE, task)
-            batch = self._group.deal(batch)
-        self._gradient_step(batch, task)
-
-    def _make_optimizer(self) -> torch.optim.Adam:
-        config, parameters = self.config, self.network.parameters()
-        if isinstance(self._evaluate, NativeEvaluate):
-            return NativeAdam(parameters, config.learning_rate, config.adam_epsilon, self._evaluate.network)
-        is_graph = config.engine == "graph"
-        return torch.optim.Adam(
-            parameters, lr=config.learning_rate, eps=config.adam_epsilon, fused=True, capturable=is_graph
-        )
-
-    def _make_step(self) -> Step:
-        if self.config.engine == "graph":
-            return GraphedStep(self._device_step, self.optimizer, self.generator)
-        return self._device_step
-
-    def _gradient_step(self, batch: Batch, task: int) -> None:
+        """One gradient step on a batch of one task."""
         parts = (batch.observations, batch.actions, batch.rewards, batch.next_observations, batch.terminated)
         self._step(DeviceBatch(*(self._tensor(part) for part in parts)), task)
         self.updates += 1
@@ -132,74 +144,42 @@ class Learner(Stateful):
         config, rewards_B = self.config, batch.rewards_B
         if config.clip_rewards:
             rewards_B = rewards_B.clamp(-1.0, 1.0)
-        q_BA, q_next_BA, q_choice_BA = self._evaluate(batch.observations, batch.next_observations, task, self.generator)
+        values = self.engine.values(batch.observations, batch.next_observations, task, self.generator)
         with torch.no_grad():
-            q_choice_BA = q_choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
-            target_B = td_target(rewards_B, batch.terminated_B, q_next_BA, q_choice_BA, config.discount)
-        q_B = q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
-        loss = F.mse_loss(q_B, target_B) if config.loss == "mse" else F.huber_loss(q_B, target_B)
+            q_choice_BA = values.choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
+            target_B = td_target(rewards_B, batch.terminated_B, values.next_BA, q_choice_BA, config.discount)
+        q_B = values.q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
+        loss = self._loss(q_B, target_B)
         for parameter in self._trained:
             parameter.grad = None
         loss.backward()
-        if config.gradient_clip == "value":
-            torch.nn.utils.clip_grad_value_(self._trained, config.gradient_clip_at)
-        elif config.gradient_clip == "norm":
-            torch.nn.utils.clip_grad_norm_(self._trained, config.gradient_clip_at)
+        self._clip(self._trained, config.gradient_clip_at)
         self.optimizer.step()
         with torch.no_grad():
-            loss, q = loss.detach(), q_B.mean()
-            if self._group is not None:
-                loss, q = self._group.sum(torch.stack([loss, q])) / self._group.size
-            self.loss_sum += loss
-            self.q_sum += q
+            self.loss_sum += self.engine.over_processes(loss.detach())
+            self.q_sum += self.engine.over_processes(q_B.mean())
 
     def copy_target(self) -> None:
         """Q* <- Q, running statistics included."""
-        if self._group is not None and self._group.rank == 0:
-            self._group.announce(COPY_TARGET)
         self.target.load_state_dict(self.network.state_dict())
 
     def parameters(self) -> Tensor:
-        """theta as one vector: a copy, never a view of the live parameters (ALGORITHM section 4)."""
+        """theta as one vector: a copy, never a view of the live parameters (docs/algorithm.md)."""
         return torch.cat([parameter.detach().reshape(-1) for parameter in self.network.parameters()])
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put a saved state back; JSON made the optimiser's parameter numbers text."""
+        """Put a saved state back; JSON made the optimizer's parameter numbers text."""
         optimizer = state["optimizer"]
         numbered = {int(number): values for number, values in optimizer["state"].items()}
         state = {**state, "optimizer": {**optimizer, "state": numbered}}
         super().load_state_dict(state)
-        self._step = self._make_step()  # the optimiser's tensors are others now
-        if self._group is not None and self._group.rank == 0:
-            self._group.announce(LOAD)
-            self._group.share(state)
-
-    def serve(self, like: Batch) -> None:
-        """Another process's part in the updates, until the first one stops.
-
-        Args:
-            like: a batch of the shapes and dtypes that are dealt to this process.
-        """
-        assert self._group is not None
-        while (message := self._group.heard())[0] != STOP:
-            what, task = message
-            if what == UPDATE:
-                self._gradient_step(self._group.dealt(like), task)
-            elif what == COPY_TARGET:
-                self.copy_target()
-            else:
-                super().load_state_dict(self._group.share())
-        self._release()
+        # The optimizer's tensors are others now.
+        self._step = self.engine.executed(self._device_step, self.optimizer, self.generator)
 
     def close(self) -> None:
-        """Let the other processes go; no update can follow."""
-        if self._group is not None:
-            self._group.announce(STOP)
-            self._release()
-
-    def _release(self) -> None:
-        """Let DistributedDataParallel go while its process group is there: later, PyTorch may abort the process."""
-        del self._evaluate
+        """Let the engine go; no update can follow."""
+        # DistributedDataParallel must go while its process group exists: later, PyTorch may abort the process.
+        del self.engine
 
     def take_means(self) -> dict[str, float]:
         """Mean loss and mean Q(s, a) of the updates since the last call; empty if there were none."""
@@ -232,3 +212,12 @@ class Learner(Stateful):
 
     def _tensor(self, array: npt.NDArray[np.generic] | Tensor) -> Tensor:
         return array if isinstance(array, Tensor) else to_device(array, self.device)
+
+
+_T = TypeVar("_T")
+
+
+def _named(table: dict[str, _T], key: str, name: str) -> _T:
+    if name not in table:
+        raise ConfigError(f"{key} is {name!r}, expected one of: {', '.join(table)}")
+    return table[name]

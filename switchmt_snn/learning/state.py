@@ -1,7 +1,7 @@
 """Saving and loading the state of the parts of a run.
 
 A stateful part names what it saves in ``SAVED`` and what it can rebuild (settings, caches, things handed in) in
-``DERIVED``; tests/test_state.py walks all parts and fails if an attribute is in neither.
+``DERIVED``; tests/learning/test_training.py walks all parts and fails if an attribute is in neither.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, LayerHealth, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
 from switchmt_snn.machine.memory import GIB
@@ -51,7 +52,9 @@ def make_learner(
     network_seed, _, _, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
     network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
     encode = int(encode_seed.generate_state(1)[0]) + (0 if group is None else group.rank)
-    return Learner(network, config.learning, suite.valid_actions_KA, device, encode, group)
+    if group is None:
+        return Learner(network, config.learning, suite.valid_actions_KA, device, encode)
+    return SharedLearner(network, config.learning, suite.valid_actions_KA, device, encode, group)
 
 
 class Training(Stateful):

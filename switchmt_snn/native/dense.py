@@ -14,15 +14,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from switchmt_snn.native.library import library
+from switchmt_snn.native.supports import has_amx
 
 _CHANNELS = 32
 """Output channels that C++ sums together; a product's must be a multiple of it."""
-
-
-def has_amx() -> bool:
-    """Whether multiplications of bfloat16 have a unit of their own, which PyTorch uses. By its peak it is faster than
-    what is here; that was not measured."""
-    return bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
 
 
 def convolution(x_ICHW: Tensor, weight: Tensor, bias_O: Tensor, stride: int) -> Tensor:

@@ -16,9 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from switchmt_snn.native import supports
 from switchmt_snn.native.neurons import Currents, Form, Neurons, Spikes, batch_moments, scaled_images
-from switchmt_snn.native.products import Gradients, Synapses, connected, convolved, spikes_as_bits
+from switchmt_snn.native.products import Gradients, Synapses, connected, convolved
 from switchmt_snn.native.streams import Gains, Heads
+from switchmt_snn.native.supports import spikes_as_bits
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
 WayBack = Callable[[Tensor], list[Tensor]]
@@ -46,7 +48,8 @@ class NativeNetwork:
     """
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
-        """Raises ValueError for a network that the native engine has no code for."""
+        """Raises ConfigError for a network that :mod:`switchmt_snn.native.supports` refuses."""
+        supports.require(network)
         self._network = network
         self._parameters = list(network.parameters())
         self._dtype = torch.float32 if precision is None else precision

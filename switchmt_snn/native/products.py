@@ -20,7 +20,6 @@ from switchmt_snn.native.dense import (
     convolution,
     convolution_input_gradient,
     convolution_weight_gradient,
-    has_amx,
     matrix_product,
     out_side,
 )
@@ -32,12 +31,6 @@ _LANES = 64
 Gradients = Callable[[Tensor, bool], tuple[Tensor | None, list[Tensor]]]
 """From the gradient of the products (``[I, ..., O]``, contiguous, in their dtype): that of the inputs, if asked for, as
 numbers ``[I, ..., C]`` that lie in memory as the inputs do; and those of :attr:`Synapses.parameters`, float32."""
-
-
-def spikes_as_bits(dtype: torch.dtype) -> bool:
-    """Whether products of spikes in a dtype are those of bits here: the processor needs AVX-512, and for bfloat16 no
-    AMX."""
-    return bool(library().snn_has_products()) and not (dtype == torch.bfloat16 and has_amx())
 
 
 class Synapses:

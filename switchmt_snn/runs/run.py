@@ -19,6 +19,7 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evalu
 from switchmt_snn.config import ExperimentConfig, from_dict, load_config, resolve, to_dict
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.events import Event, Stepped
+from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
@@ -145,6 +146,7 @@ def _serve(group: ProcessGroup) -> RunResult:
     config = from_dict(group.share())
     suite = make_suite(config.tasks)
     learner = make_learner(config, suite, group.device(config.device), group)
+    assert isinstance(learner, SharedLearner)
     size = config.learning.batch_size // group.size
     observations = np.zeros((size, *suite.observation_shape), suite.frame_dtype)
     numbers = np.zeros(size, np.int64)

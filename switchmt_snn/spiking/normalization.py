@@ -6,8 +6,6 @@ last (docs/algorithm.md, deviation 6). Affine weights are shared always, so the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -31,8 +29,6 @@ class TaskBatchNorm(nn.Module):
         self.register_buffer("running_var_KC", torch.ones(rows, num_channels))
         self.momentum = momentum
         self.epsilon = epsilon
-        self.sum_over_processes: Callable[[Tensor], Tensor] | None = None
-        self.num_processes = 1
 
     def forward(self, x: Tensor, task: int) -> Tensor:
         """Normalise by the batch in training mode (and move the task's running statistics), by the task's running
@@ -42,23 +38,7 @@ class TaskBatchNorm(nn.Module):
     def normalize(self, x: Tensor, statistics: tuple[Tensor, ...], training: bool) -> Tensor:
         """As :meth:`forward`, with a task's running mean and variance ``[C]`` and the mode handed in."""
         mean_C, var_C = statistics
-        if training and self.sum_over_processes is not None:
-            return self._normalize_over_processes(x, mean_C, var_C, self.sum_over_processes)
         return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, training, self.momentum, self.epsilon)
-
-    def _normalize_over_processes(
-        self, x: Tensor, mean_C: Tensor, var_C: Tensor, total: Callable[[Tensor], Tensor]
-    ) -> Tensor:
-        """By the statistics of all processes' parts of a batch, which are of one size."""
-        shape = (1, -1, *(1,) * (x.dim() - 2))
-        others = [d for d in range(x.dim()) if d != 1]
-        count = x.numel() // x.shape[1] * self.num_processes
-        batch_mean_C = total(x.sum(others)) / count
-        centered = x - batch_mean_C.view(shape)
-        batch_var_C = total(centered.square().sum(others)) / count
-        self.move((mean_C, var_C), batch_mean_C, batch_var_C, count)
-        scale_C = self.weight * (batch_var_C + self.epsilon).rsqrt()
-        return centered * scale_C.view(shape) + self.bias.view(shape)
 
     @torch.no_grad()
     def move(self, statistics: tuple[Tensor, ...], batch_mean_C: Tensor, batch_var_C: Tensor, count: int) -> None:

@@ -11,7 +11,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.machine.devices import has_bfloat16
 from switchmt_snn.native import library as native_library
 from switchmt_snn.native import neurons as native
-from switchmt_snn.native.products import spikes_as_bits
+from switchmt_snn.native.supports import spikes_as_bits
 
 COMPILE_FROM_UPDATES = 150_000
 """``engine=auto`` compiles runs of at least this many updates: half a minute at the start, minutes to hours back."""

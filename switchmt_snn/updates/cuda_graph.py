@@ -1,37 +1,61 @@
-"""A learner's whole update as one CUDA graph: forward passes, target, backward, clipping, Adam and the sums of metrics
-are launched by one call, so the host's time for some hundred kernels is no part of an update.
+"""The graph engine: a learner's whole update as one CUDA graph.
 
-A graph is captured for every task, because a task's running statistics and gains lie at addresses of their own. Nothing
-in an update reads a number back to the host (a test watches that), and everything that it changes stays where it is.
+One call launches forward passes, target, backward, clipping, Adam and the sums of metrics, so the host does not launch
+some hundred kernels one by one. A graph is captured for every task, because each task's running statistics and gains
+have addresses of their own. An update must not read a number back to the host (a test watches that), and every tensor
+that it changes must keep its address.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
+from switchmt_snn.config import ExperimentConfig, LearningConfig
 from switchmt_snn.errors import TrainingFailed
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.updates.compiled import compiled
+from switchmt_snn.updates.passes import DifferentiatedPass, forward_passes
+from switchmt_snn.updates.protocol import DeviceBatch, Engine, Step, Values, adam
 
 WARMUP_UPDATES = 3
-"""Updates before the first capture: compilation, autotuning and the optimiser's state come with them."""
+"""Updates before the first capture: compilation, autotuning and the optimizer's state come with them."""
 
 
-class DeviceBatch(NamedTuple):
-    """A batch of one task on the learner's device."""
+class CudaGraph(Engine):
+    """Compiled by torch.compile and captured as a CUDA graph."""
 
-    observations: Tensor
-    """``[B, *shape]``, raw."""
-    actions_B: Tensor
-    rewards_B: Tensor
-    next_observations: Tensor
-    terminated_B: Tensor
+    name = "graph"
+    needs = "a run on a CUDA device"
 
+    def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
+        super().__init__(network, target, config)
+        differentiated = DifferentiatedPass(network, self.precision)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q, compiled)
 
-Step = Callable[[DeviceBatch, int], None]
-"""An update on a batch of a task."""
+    @classmethod
+    def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
+        """See :meth:`Engine.unavailable`."""
+        if device.type != "cuda":
+            return f"this one is on device {device.type}"
+        return super().unavailable(config, device, processes)
+
+    @classmethod
+    def status(cls) -> str:
+        """See :meth:`Engine.status`."""
+        return "works" if torch.cuda.is_available() else "no CUDA device"
+
+    def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
+        """See :meth:`Engine.values`."""
+        return self._passes(observations, next_observations, task, generator)
+
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Adam whose step can be captured."""
+        return adam(self.network, self.config, capturable=True)
+
+    def executed(self, step: Step, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> Step:
+        """See :meth:`Engine.executed`."""
+        return GraphedStep(step, optimizer, generator)
 
 
 class GraphedStep:
@@ -42,7 +66,7 @@ class GraphedStep:
 
         Args:
             step: changes tensors in place only, and never waits for the device.
-            optimizer: its gradients are set to None before a capture, so that they lie in the graph's memory.
+            optimizer: its gradients are set to None before a capture, so that they are made in the graph's memory.
             generator: whose random numbers the step draws.
         """
         self._step, self._optimizer, self._generator = step, optimizer, generator
@@ -74,7 +98,7 @@ class GraphedStep:
         self._optimizer.zero_grad(set_to_none=True)
         graph = torch.cuda.CUDAGraph()
         graph.register_generator_state(self._generator)
-        # Other threads may send frames meanwhile: what they call is no concern of this capture.
+        # Other threads may send frames meanwhile; their calls must not end this capture.
         try:
             with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
                 self._step(batch, task)

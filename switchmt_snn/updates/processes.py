@@ -1,9 +1,10 @@
-"""A learner on several processes under ``torchrun``: the first one plays and remembers, all of them update.
+"""Updates that several processes under ``torchrun`` divide: how they talk, and the engine that averages their parts.
 
-The first process runs the whole of Algorithm 1. For every update it deals its batch out in equal parts; each process
-computes its part's gradient, ``DistributedDataParallel`` averages them, BatchNorm sums its statistics over all
-processes, and every process takes the same Adam step. So the run is that of one process, to rounding (random encodings
-apart: every process draws its own spikes).
+The first process runs the whole of Algorithm 1 (:class:`~switchmt_snn.learning.shared_learner.SharedLearner`). For
+every update it deals its batch out in equal parts. Each process computes its part's gradient,
+``DistributedDataParallel`` averages them, BatchNorm sums its statistics over all processes, and every process takes the
+same Adam step. So the run is that of one process, to rounding. Random encodings are the exception: every process draws
+its own spikes.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+from collections.abc import Callable
 from dataclasses import fields
 from datetime import timedelta
 from typing import Any
@@ -18,9 +20,15 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
+from switchmt_snn.config import LearningConfig
 from switchmt_snn.machine.devices import select_device
 from switchmt_snn.replay.ring import Batch
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.spiking.normalization import TaskBatchNorm
+from switchmt_snn.updates.passes import DifferentiatedPass, forward_passes
+from switchmt_snn.updates.protocol import Engine, Values
 
 STOP, UPDATE, COPY_TARGET, LOAD = range(4)
 """What the first process announces."""
@@ -51,13 +59,13 @@ class ProcessGroup:
     """
 
     def __init__(self) -> None:
-        """Join the others (gloo for what lies on the CPU, NCCL for what lies on GPUs)."""
+        """Join the others (gloo for tensors on the CPU, NCCL for tensors on GPUs)."""
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
         dist.init_process_group(backend, timeout=timedelta(days=7))  # the first process may evaluate for hours
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
 
     def device(self, wish: str) -> torch.device:
-        """A wish for a device as this process's own: one GPU for each process of a machine."""
+        """A requested device as this process's own: one GPU for each process of a machine."""
         device = select_device(wish)
         return torch.device(device.type, int(os.environ["LOCAL_RANK"])) if device.type == "cuda" else device
 
@@ -67,11 +75,11 @@ class ProcessGroup:
         return total
 
     def announce(self, what: int, task: int = 0) -> None:
-        """First process: tell the others what comes."""
+        """First process: tell the others what comes next."""
         dist.broadcast(torch.tensor([what, task]), 0)
 
     def heard(self) -> tuple[int, int]:
-        """Other processes: what comes, and for which task."""
+        """Other processes: what comes next, and for which task."""
         message = torch.zeros(2, dtype=torch.int64)
         dist.broadcast(message, 0)
         what, task = message.tolist()
@@ -103,7 +111,7 @@ class ProcessGroup:
         return box[0]
 
     def leave(self) -> None:
-        """Leave the group; what refers to it must be let go before."""
+        """Leave the group; everything that refers to it must be dropped before."""
         gc.collect()
         dist.destroy_process_group()
 
@@ -119,3 +127,49 @@ def join_processes() -> ProcessGroup | None:
     if group.rank > 0:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return group
+
+
+class Divided(Engine):
+    """The eager engine on one process's part of each batch. Made for a group, so it is not in the registry."""
+
+    name = "eager"
+    needs = "processes that torchrun started"
+    torchrun = True
+
+    def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig, group: ProcessGroup) -> None:
+        super().__init__(network, target, config)
+        self._group = group
+        for module in network.modules():
+            if isinstance(module, TaskBatchNorm):
+                module.normalize = _normalize_over(group, module)  # type: ignore[method-assign]
+        differentiated = DistributedDataParallel(DifferentiatedPass(network, self.precision), broadcast_buffers=False)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q)
+
+    def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
+        """See :meth:`Engine.values`; of this process's part of a batch."""
+        return self._passes(observations, next_observations, task, generator)
+
+    def over_processes(self, mean: Tensor) -> Tensor:
+        """See :meth:`Engine.over_processes`."""
+        return self._group.sum(mean) / self._group.size
+
+
+def _normalize_over(group: ProcessGroup, layer: TaskBatchNorm) -> Callable[..., Tensor]:
+    """:meth:`TaskBatchNorm.normalize` that in training normalizes by the statistics of all processes' parts of a batch,
+    which have one size."""
+    alone = layer.normalize
+
+    def normalize(x: Tensor, statistics: tuple[Tensor, ...], training: bool) -> Tensor:
+        if not training:
+            return alone(x, statistics, training)
+        shape = (1, -1, *(1,) * (x.dim() - 2))
+        others = [d for d in range(x.dim()) if d != 1]
+        count = x.numel() // x.shape[1] * group.size
+        batch_mean_C = group.sum(x.sum(others)) / count
+        centered = x - batch_mean_C.view(shape)
+        batch_var_C = group.sum(centered.square().sum(others)) / count
+        layer.move(statistics, batch_mean_C, batch_var_C, count)
+        scale_C = layer.weight * (batch_var_C + layer.epsilon).rsqrt()
+        return centered * scale_C.view(shape) + layer.bias.view(shape)
+
+    return normalize

@@ -14,7 +14,8 @@ from switchmt_snn.native import library as native_library
 from switchmt_snn.native import network as native_network
 from switchmt_snn.native.network import NativeNetwork
 from switchmt_snn.native.neurons import Spikes
-from switchmt_snn.native.products import Panels, Synapses, convolved, spikes_as_bits
+from switchmt_snn.native.products import Panels, Synapses, convolved
+from switchmt_snn.native.supports import spikes_as_bits
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from tests.conftest import small_config
 

@@ -10,6 +10,7 @@ import torch
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.training import make_learner
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.tasks.registry import make_suite
@@ -60,6 +61,7 @@ def main(path: str) -> None:
     group = join_processes()
     assert isinstance(group, ProcessGroup)
     learner = make_learner(config(), make_suite(config().tasks), torch.device("cpu"), group)
+    assert isinstance(learner, SharedLearner)
     if group.rank == 0:
         safetensors.torch.save_file(outcome(learner), path)
         learner.close()

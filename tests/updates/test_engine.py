@@ -19,7 +19,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.native import library as native_library
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.updates import choice as machine
-from switchmt_snn.updates.engine import make_evaluate
+from switchmt_snn.updates.engine import ENGINES
 from tests.conftest import small_config
 
 CPU = torch.device("cpu")
@@ -51,8 +51,8 @@ def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | No
     for part in (*network.parameters(), *target.parameters()):
         part.data = (part.data * 256).round() / 256  # sums of products are exact, so that no spike hangs on their order
     x, following = (torch.rand(2, 8, *images.shape) < 0.4).to(torch.uint8)
-    evaluate = make_evaluate(network, target, engine, precision, double_q=True)
-    values = evaluate(x, following, task, torch.Generator().manual_seed(5))
+    learning = replace(config.learning, double_q=True, precision="bfloat16" if precision else "float32")
+    values = ENGINES[engine](network, target, learning).values(x, following, task, torch.Generator().manual_seed(5))
     q_BA = values.q_BA
     (q_BA * torch.linspace(-1, 2, q_BA.numel()).view_as(q_BA)).sum().backward()
     assert not values.next_BA.requires_grad

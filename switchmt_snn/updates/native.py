@@ -1,0 +1,103 @@
+"""The native engine: the forward passes, their backward and Adam in C++, for spiking networks on a CPU.
+
+The only file outside of ``native/`` that imports it, and only when a run takes the engine: without that folder,
+everything else works, and the engine says why it does not.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig, LearningConfig
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.updates.protocol import Engine, Values
+
+
+class Native(Engine):
+    """In C++, which is built once per machine."""
+
+    name = "native"
+    needs = "a spiking network on a CPU and a C++ compiler (g++, or what CXX names)"
+    note = "updates run natively, in C++ (learning.engine=eager does without)"
+
+    def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
+        """Raises ValueError for a network that the C++ code does not support, naming what it does not."""
+        super().__init__(network, target, config)
+        from switchmt_snn.native.network import NativeNetwork
+
+        self._online, self._target = NativeNetwork(network, self.precision), NativeNetwork(target, self.precision)
+
+    @classmethod
+    def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
+        """See :meth:`Engine.unavailable`; builds the C++ sources if they are not built yet."""
+        if (reason := super().unavailable(config, device, processes)) is not None:
+            return reason
+        if device.type != "cpu":
+            return f"this run is on device {device.type}"
+        supports = _supports()
+        if supports is None:
+            return _MISSING
+        if (setting := supports.unsupported_setting(config.network)) is not None:
+            return f"it has no code for {setting}"
+        problem = supports.problem()
+        return None if problem is None else f"it cannot be built here ({problem})"
+
+    @classmethod
+    def pays(cls, config: ExperimentConfig, device: torch.device, precision: str) -> bool:
+        """On the nature trunk it is the fastest engine (docs/performance.md) if its products of spikes are sums over
+        bits, or the other products are bfloat16. MinAtar's small network is faster compiled.
+        """
+        spiking = METHOD_TRAITS[config.network.method].spiking
+        if device.type != "cpu" or config.network.trunk != "nature" or not spiking:
+            return False
+        supports = _supports()
+        if precision == "bfloat16" or supports is None or supports.problem() is not None:
+            return True  # if it cannot be built, unavailable() says why
+        return bool(supports.spikes_as_bits(torch.float32))
+
+    @classmethod
+    def status(cls) -> str:
+        """See :meth:`Engine.status`; builds the C++ sources if they are not built yet."""
+        supports = _supports()
+        if supports is None:
+            return _MISSING
+        problem: str | None = supports.problem()
+        if problem is not None:
+            return problem
+        has_bits = supports.spikes_as_bits(torch.float32)
+        return "works" if has_bits else "works, without sums over bits (no AVX-512)"
+
+    def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
+        """See :meth:`Engine.values`. The choice of the next action shares products with the differentiated pass."""
+        online, target, double_q = self._online, self._target, self.config.double_q
+        x_next = target.inputs(next_observations, generator)
+        with torch.no_grad():
+            (next_BA,) = target.decide(x_next, target.view(task), training=False)
+        if double_q and self.network.encoder.is_random:
+            x_next = online.inputs(next_observations, generator)
+        x, others = online.inputs(observations, generator), [x_next] if double_q else []
+        q_BA, *choice = online.decide(x, online.view(task), training=True, beside=others)
+        return Values(q_BA, next_BA, *(choice or [next_BA]))
+
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Adam in C++, which also writes the weights' rounded copies."""
+        from switchmt_snn.native.adam import NativeAdam
+
+        return NativeAdam(self.network.parameters(), self.config.learning_rate, self.config.adam_epsilon, self._online)
+
+
+_MISSING = "the package switchmt_snn.native is not installed"
+
+
+def _supports() -> ModuleType | None:
+    """The module that says what the C++ code supports; None if the package lacks it."""
+    try:
+        from switchmt_snn.native import supports
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("switchmt_snn.native"):
+            raise
+        return None
+    return supports
