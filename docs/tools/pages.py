@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from docs.tools.performance_page import performance_page
+from docs.tools.picture import picture
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import field_documentation, load_config
 from switchmt_snn.export.report.page import microjoule
@@ -347,6 +348,7 @@ PAGES = {
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,
     "docs/performance.md": performance_page,
+    "docs/picture.svg": picture,
 }
 
 
