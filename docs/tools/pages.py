@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from docs.tools.energy_page import energy_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
 from switchmt_snn.acting.evaluation import EvaluationProtocol
@@ -344,6 +345,7 @@ def profile_page() -> str:
 
 PAGES = {
     "docs/configuration.md": configuration_page,
+    "docs/energy.md": energy_page,
     "results/minatar/README.md": minatar_page,
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,

@@ -20,6 +20,7 @@ from switchmt_snn.export.selection import Selection
 from switchmt_snn.export.yaml_files import parse
 from tests.export.chip_networks import BUILT_IN, chain, conv, linear
 
+ROOT = Path(__file__).parents[2]
 CHIP: dict[str, Any] = {
     "kind": "chip",
     "name": "mine",
@@ -243,7 +244,7 @@ def test_a_name_of_both_kinds_selects_both_and_no_name_everything() -> None:
 
 
 def test_built_in_files_bear_their_chips_names() -> None:
-    folder = Path(__file__).parents[2] / "export" / "chips" / "builtin"
+    folder = ROOT / "export" / "chips" / "builtin"
     assert {path.stem for path in folder.glob("*.yaml")} == set(builtin_chips()) == set(BUILT_IN)
     for path in folder.glob("*.yaml"):
         assert load_chip(path) == builtin_chips()[path.stem]
@@ -253,3 +254,27 @@ def test_fits_are_plain_json(tmp_path: Path) -> None:
     (tmp_path / "my.yaml").write_text(yaml.safe_dump(CHIP))
     fit = check_fit(chain(5, 3), str(tmp_path / "my.yaml"))
     assert json.loads(json.dumps(fit.to_dict(), allow_nan=False))["layers"][0]["not_held"] == ""
+
+
+def recipe(heading: str) -> str:
+    """The YAML file in a section of docs/extending.md."""
+    section = (ROOT / "docs" / "extending.md").read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return section.split("```yaml\n")[1].split("```")[0]
+
+
+def test_the_recipes_in_the_docs_are_a_target_and_a_chip(tmp_path: Path) -> None:
+    for name, heading in (("my_target.yaml", "Energy target"), ("my_chip.yaml", "Chip")):
+        (tmp_path / name).write_text(recipe(heading))
+    selection = Selection.of([tmp_path / "my_target.yaml", tmp_path / "my_chip.yaml"])
+    (target,), (own,) = selection.targets, selection.chips
+    assert (target.name, target.operations_pj["mac"], own.name) == ("my-target", 2.5, "my-chip")
+    assert check_fit(chain(64, 32, 8), own).fits
+    assert not check_fit(chain(64, 32, 33), own).fits
+
+
+def test_the_docs_name_every_key_of_a_chip_file() -> None:
+    keys = (ROOT / "docs" / "energy.md").read_text().split("### A chip of your own")[1]
+    for chip_key in yaml.safe_load(recipe("Chip")):
+        assert f"`{chip_key}`" in keys
+    for key in ("per", "only", "whole_channels", "has", "unit"):
+        assert f"`{key}`" in keys
