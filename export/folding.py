@@ -21,8 +21,9 @@ from torch import Tensor, nn
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
+from switchmt_snn.spiking.layers import side_by_side
 from switchmt_snn.spiking.network import QNetwork, Stream, TrunkLayer
-from switchmt_snn.spiking.neurons import SpikingLayer
+from switchmt_snn.spiking.neurons import LeakyNode, NeuronLayer, ReLUNode
 from switchmt_snn.tasks.suite import TaskSuite
 
 Array = npt.NDArray[np.float64]
@@ -169,15 +170,12 @@ def _float64(tensor: Tensor) -> Array:
 
 def _neurons(layers: list[tuple[nn.Module, int]]) -> Neurons:
     """Neuron layers side by side, each with its number of channels."""
-    betas, thresholds, reset = [], [], "none"
-    for layer, channels in layers:
-        if not isinstance(layer, SpikingLayer):
-            return Neurons("relu", np.zeros(1), np.zeros(1), "none")
-        betas.append(np.full(channels, float(layer.leaky.beta.detach().clamp(0, 1))))
-        thresholds.append(np.full(channels, float(layer.leaky.threshold.detach())))
-        reset = layer.reset
-    beta_O = np.concatenate(betas)
-    return Neurons("IF" if (beta_O == 1.0).all() else "LIF", beta_O, np.concatenate(thresholds), reset)
+    node = side_by_side([cast(NeuronLayer, layer).node(channels) for layer, channels in layers])
+    if isinstance(node, ReLUNode):
+        return Neurons("relu", np.zeros(1), np.zeros(1), "none")
+    if isinstance(node, LeakyNode):
+        return Neurons(node.kind, node.beta_O, node.threshold_O, node.reset)
+    raise ExportError(f"network.neuron is {node.kind}, expected IF or LIF; exports do not have it")
 
 
 def _trunk_layer(name: str, layer: TrunkLayer, tasks: range) -> Layer:

@@ -22,7 +22,7 @@ from switchmt_snn.export.runtimes.agents import encode
 from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.network import Stream
-from switchmt_snn.spiking.neurons import SpikingLayer
+from switchmt_snn.spiking.neurons import LeakyLayer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 _DYADIC_BETAS = (0.0, 0.5, 0.75, 0.875)
@@ -75,7 +75,7 @@ def dyadic_copy(agent: Agent, weight_bits: int = 5) -> Agent:
                 _round_normalization(module, network.spiking)
             elif isinstance(module, ActiveDendrites):
                 _round_dendrites(module)
-            elif isinstance(module, SpikingLayer):
+            elif isinstance(module, LeakyLayer):
                 module.leaky.threshold.copy_(_to_grid(module.leaky.threshold, 3).clamp(min=0.125))
                 if float(module.leaky.beta) != 1.0:
                     module.leaky.beta.fill_(min(_DYADIC_BETAS, key=lambda beta: abs(beta - float(module.leaky.beta))))
@@ -120,8 +120,8 @@ def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any], seed: int 
     # snnTorch's neurons write into themselves; copies keep calls from several threads apart.
     same_bits, wide = copy.deepcopy(agent.network), copy.deepcopy(agent.network).double()
     for module in wide.modules():
-        if isinstance(module, SpikingLayer):
-            module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
+        if isinstance(module, LeakyLayer):
+            module.surrogate = module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
     scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, seed).copy())
     narrow_activity: dict[str, torch.Tensor] = {}
     wide_activity: dict[str, torch.Tensor] = {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
+from switchmt_snn.config.plugins import PluginName
 from switchmt_snn.config.suites import require_suite_name, stored_suite_name, suite_defaults
 from switchmt_snn.errors import ConfigError
 
@@ -111,10 +112,17 @@ class NetworkConfig:
     """Q from the head's output over time: its mean, or the last or largest membrane of a non-spiking integrator."""
     readout_beta: float = 1.0
     """Decay per step of the non-spiking integrator that the two membrane readouts use."""
-    neuron: Literal["IF", "LIF"] = "IF"
-    """snn.Leaky with beta 1 (integrate-and-fire), or with the decay `beta` (leaky)."""
+    neuron: Literal["IF", "LIF", "Synaptic", "ALIF"] | PluginName = "IF"
+    """IF, LIF (IF with the decay `beta`), Synaptic (LIF fed by a decaying current), ALIF (LIF whose threshold rises
+    with its spikes), or a class from outside the package, package.module:Class (docs/algorithm.md, Neurons)."""
     beta: float = 0.5
-    """neuron=LIF: membrane decay per simulation step (0.5 is the released script's tau of 2)."""
+    """Membrane decay per simulation step (0.5 is the released script's tau of 2). neuron=IF does not use it."""
+    alpha: float = 0.5
+    """neuron=Synaptic: decay of the synaptic current per simulation step. IF, LIF and ALIF do not use it."""
+    adaptation_decay: float = 0.9
+    """neuron=ALIF: decay of the threshold's rise per simulation step. IF, LIF and Synaptic do not use it."""
+    adaptation_strength: float = 0.2
+    """neuron=ALIF: rise of the threshold by one spike. IF, LIF and Synaptic do not use it."""
     learn_beta: bool = False
     """Train one decay per layer."""
     threshold: float = 1.0
@@ -122,7 +130,7 @@ class NetworkConfig:
     learn_threshold: bool = False
     """Train one threshold per layer."""
     reset: Literal["zero", "subtract"] = "zero"
-    """What a spike does to the membrane."""
+    """What a spike does to the membrane: set it to zero, or subtract the threshold (docs/algorithm.md, Neurons)."""
     surrogate: Literal[
         "atan",
         "sigmoid",
@@ -151,12 +159,15 @@ class NetworkConfig:
     normalization_momentum: float = 0.1
     """BatchNorm momentum of the running statistics."""
     neuron_engine: Literal["fused", "snntorch"] = "fused"
-    """fused runs the same arithmetic as snn.Leaky in one autograd function; snntorch calls snn.Leaky step by step."""
+    """fused: this package's code (IF and LIF: one autograd function, the same arithmetic as snn.Leaky). snntorch: calls
+    snnTorch's neuron step by step (IF, LIF, Synaptic)."""
 
     def __post_init__(self) -> None:
         _require(self.hidden_units is None or self.hidden_units >= 1, "network.hidden_units", self.hidden_units, ">= 1")
         _require(self.timesteps >= 1, "network.timesteps", self.timesteps, "at least 1")
-        _require(0.0 <= self.beta <= 1.0, "network.beta", self.beta, "a decay in [0, 1]")
+        for key in ("beta", "alpha", "adaptation_decay"):
+            _require(0.0 <= getattr(self, key) <= 1.0, f"network.{key}", getattr(self, key), "a decay in [0, 1]")
+        _require(self.adaptation_strength >= 0.0, "network.adaptation_strength", self.adaptation_strength, "at least 0")
         _require(0.0 <= self.readout_beta <= 1.0, "network.readout_beta", self.readout_beta, "a decay in [0, 1]")
         _require(self.threshold > 0.0, "network.threshold", self.threshold, "above 0")
         _require(0.0 < self.event_threshold < 1.0, "network.event_threshold", self.event_threshold, "within (0, 1)")

@@ -8,6 +8,9 @@ from typing import Any
 
 from switchmt_snn.errors import ConfigError
 
+PluginName = str
+"""The type of a config value that may name a class from outside the package: ``Literal[...] | PluginName``."""
+
 _PLUGIN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 

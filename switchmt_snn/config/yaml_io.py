@@ -20,6 +20,7 @@ import yaml
 
 from switchmt_snn.config import experiment as config_module
 from switchmt_snn.config.experiment import ExperimentConfig
+from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError, did_you_mean
 
 
@@ -116,6 +117,9 @@ def _convert(hint: Any, value: Any, where: str, key: str) -> Any:
         if value is None and type(None) in arms:
             return None
         arms = tuple(arm for arm in arms if arm is not type(None))
+        if str in arms and is_plugin(value):  # Literal[...] | PluginName
+            return value
+        arms = tuple(arm for arm in arms if arm is not str) if len(arms) > 1 else arms
         if all(get_origin(arm) is Literal for arm in arms):
             return _choice(tuple(c for arm in arms for c in get_args(arm)), value, where, key)
         return _convert(arms[0], value, where, key)

@@ -41,6 +41,8 @@ def unsupported(config: NetworkConfig, spiking: bool) -> str | None:
         return f"network.method={config.method} (no spikes)"
     if config.learn_beta or config.learn_threshold:
         return "network.learn_beta or network.learn_threshold"
+    if config.neuron not in ("IF", "LIF"):
+        return f"network.neuron={config.neuron}"
     if config.surrogate not in _SURROGATES:
         return f"network.surrogate={config.surrogate}"
     if config.k_winners is not None:
@@ -74,7 +76,7 @@ class Currents(NamedTuple):
 class Neurons:
     """T steps of a network's neurons on synaptic products ``[S, R, C]``, floats or bfloat16.
 
-    Spikes are those of :class:`~switchmt_snn.spiking.neurons.SpikingLayer` for the same currents.
+    Spikes are those of :class:`~switchmt_snn.spiking.neurons.LeakyLayer` for the same currents.
     """
 
     def __init__(self, config: NetworkConfig) -> None:

@@ -17,7 +17,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.native import library as native_library
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.network import Convolution, QNetwork, Stream, TrunkLayer
-from switchmt_snn.spiking.neurons import SpikingLayer
+from switchmt_snn.spiking.neurons import LeakyLayer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 _ANY = object()
@@ -32,6 +32,9 @@ _SETTINGS: dict[str, object] = {
     "readout_beta": _ANY,
     "neuron": ("IF", "LIF"),
     "beta": _ANY,
+    "alpha": _ANY,  # IF and LIF do not use these three
+    "adaptation_decay": _ANY,
+    "adaptation_strength": _ANY,
     "learn_beta": (False,),
     "threshold": _ANY,
     "learn_threshold": (False,),
@@ -140,7 +143,7 @@ def _is_linear(module: nn.Module | None) -> bool:
 
 
 def _is_neurons(module: nn.Module | None) -> bool:
-    return type(module) is SpikingLayer and module.fused
+    return type(module) is LeakyLayer and module.fused
 
 
 _TRUNK_PARTS: dict[str, _Check] = {

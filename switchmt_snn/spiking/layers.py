@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,13 +20,15 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NeuronNode:
-    """Neurons of one layer. A model's own node adds its parameters; a field ending in ``_O`` has one value per channel.
+    """Neurons of one layer. A model's own node adds its parameters.
 
-    Attributes:
-        kind: the model's name in metadata and reports (``IF``, ``LIF``, ``relu``, ...).
+    A field ending in ``_O`` has one value per output channel.
     """
 
-    kind: ClassVar[str] = ""
+    @property
+    def kind(self) -> str:
+        """The model's name in metadata and reports (``IF``, ``LIF``, ``relu``, ...)."""
+        raise NotImplementedError(f"{type(self).__name__} has no kind, expected a name")
 
     def facts(self) -> dict[str, Any]:
         """Plain values of all parameters; one number where all channels share it."""

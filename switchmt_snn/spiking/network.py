@@ -29,7 +29,7 @@ from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.dendrites import ActiveDendrites, keep_k_winners
 from switchmt_snn.spiking.encodings import Encoder
-from switchmt_snn.spiking.neurons import ReLULayer, SpikingLayer, make_neuron_layer
+from switchmt_snn.spiking.neurons import NeuronLayer, NeuronState, make_neuron_layer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -39,8 +39,8 @@ CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
 }
 """(output channels, kernel, stride) of each trunk's convolutions."""
 
-State = dict[str, Tensor]
-"""Membranes ``[B, ...]`` by layer name; an empty dict is the resting state."""
+State = dict[str, NeuronState]
+"""State variables of each layer's neurons (``NeuronLayer.STATE``) by layer name; an empty dict is the resting state."""
 
 Context = dict[str, tuple[Tensor, ...]]
 """All that tells a network its task, by layer name: BatchNorm's running mean and variance ``[C]``, or the dendrites'
@@ -93,7 +93,7 @@ class Convolution(nn.Conv2d):
 class TrunkLayer(nn.Module):
     """Convolution (or linear map), BatchNorm, neurons."""
 
-    def __init__(self, synapses: nn.Module, normalization: TaskBatchNorm | None, neurons: SpikingLayer | ReLULayer):
+    def __init__(self, synapses: nn.Module, normalization: TaskBatchNorm | None, neurons: NeuronLayer):
         super().__init__()
         self.synapses = synapses
         self.normalization = normalization
@@ -211,8 +211,8 @@ class QNetwork(nn.Module):
         Args:
             observation: ``[B, *shape]``, raw (uint8 or float).
             task: task index k.
-            state: membranes to start from; changed in place to the membranes after the decision. None or an empty
-                dict starts from rest and, if None, keeps nothing.
+            state: neuron states to start from; changed in place to those after the decision. None or an empty dict
+                starts from rest and, if None, keeps nothing.
             activity: if given, filled with each neuron layer's spikes (or activations) ``[T, B, ...]`` by name.
             generator: source of random numbers of the ``rate`` encoding.
             precision: dtype of all synaptic products but the head's (:func:`synaptic_products`).
@@ -272,9 +272,7 @@ class QNetwork(nn.Module):
         state: State,
         activity: dict[str, Tensor] | None,
     ) -> Tensor:
-        spikes, membrane = layer.neurons(current, state.get(name))
-        if membrane is not None:
-            state[name] = membrane
+        spikes, state[name] = layer.neurons(current, state.get(name))
         if activity is not None:
             activity[name] = spikes
         return cast(Tensor, spikes)

@@ -24,7 +24,7 @@ from switchmt_snn.export.parity.compare import Exports, compare, trace_torch
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations, exact_copy
 from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session, read_nir, read_out
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
-from switchmt_snn.spiking.neurons import SpikingLayer
+from switchmt_snn.spiking.neurons import LeakyLayer
 from tests.export.export_cases import VARIANTS, make_agent, observations
 
 
@@ -51,7 +51,7 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     agent = make_agent(seed, **VARIANTS[variant])
     if variant == "learned":  # as after training: every layer and stream its own
         with torch.no_grad():
-            for index, module in enumerate(m for m in agent.network.modules() if isinstance(m, SpikingLayer)):
+            for index, module in enumerate(m for m in agent.network.modules() if isinstance(m, LeakyLayer)):
                 module.leaky.beta.fill_(0.4 + 0.2 * index)
                 module.leaky.threshold.fill_(0.375 + 0.125 * index)
     x = dyadic_observations(observations(agent, 24, seed))

@@ -22,7 +22,7 @@ from switchmt_snn.native.adam import NativeAdam
 from switchmt_snn.native.network import NativeNetwork
 from switchmt_snn.native.neurons import Currents, Neurons, batch_moments, scaled_images
 from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
-from switchmt_snn.spiking.neurons import SpikingLayer
+from switchmt_snn.spiking.neurons import LeakyLayer
 from switchmt_snn.updates import choice as machine
 from tests.conftest import small_config
 
@@ -40,7 +40,7 @@ FORMS = {
 
 def plain_gated(config: NetworkConfig, y_SRC: Tensor, gain_C: Tensor) -> Tensor:
     current_SRC = y_SRC.float() * gain_C
-    spikes, _ = SpikingLayer(config)(current_SRC.expand(config.timesteps, *y_SRC.shape[1:]))
+    spikes, _ = LeakyLayer(config)(current_SRC.expand(config.timesteps, *y_SRC.shape[1:]))
     return spikes
 
 
@@ -108,7 +108,7 @@ def test_normalized_spikes_equal_batch_norm_and_neurons(dtype: torch.dtype, step
     flat = y_SRC.flatten(0, 1).to(torch.float64)
     current = F.batch_norm(flat, None, None, weight_C.double(), bias_C.double(), True, 0.1, 1e-5)
     current = current.float().view(steps, 400, 24).expand(4, 400, 24)
-    spikes, _ = SpikingLayer(config)(current)
+    spikes, _ = LeakyLayer(config)(current)
     (spikes * g.to(dtype).float()).sum().backward()
     neurons = Neurons(config)
     ours, currents_4C = neurons.fire(y, Currents(weight, bias, *batch_moments(y), 1e-5), "numbers")

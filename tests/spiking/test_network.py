@@ -14,6 +14,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.network import (
     ObservationSpec,
     QNetwork,
+    State,
     Stream,
     TrunkLayer,
     build_network,
@@ -136,7 +137,7 @@ def test_state_carries_a_decision_on() -> None:
     long = build_network(replace(short.config, timesteps=6), SMALL, 0).eval()
     long.load_state_dict(short.state_dict())
     observation = torch.rand(2, 4, 10, 10)
-    state: dict[str, Tensor] = {}
+    state: State = {}
     first: dict[str, Tensor] = {}
     second: dict[str, Tensor] = {}
     whole: dict[str, Tensor] = {}

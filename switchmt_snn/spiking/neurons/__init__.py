@@ -1,0 +1,101 @@
+"""Neuron models: one file each, registered by the name that ``network.neuron`` takes.
+
+| name | class | state | file |
+|---|---|---|---|
+| IF, LIF | LeakyLayer | membrane | leaky.py |
+| Synaptic | SynapticLayer | current, membrane | synaptic.py |
+| ALIF | AdaptiveLayer | membrane, threshold_adaptation | adaptive.py |
+
+The ANN methods have ReLULayer (relu.py). A class from outside the package is named ``package.module:Class``.
+"""
+
+from __future__ import annotations
+
+from switchmt_snn.config import NetworkConfig
+from switchmt_snn.config.plugins import is_plugin, load_plugin
+from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.spiking.neurons.adaptive import AdaptiveLayer, AdaptiveNode
+from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState, OpaqueNode
+from switchmt_snn.spiking.neurons.leaky import LeakyLayer, LeakyNode
+from switchmt_snn.spiking.neurons.relu import ReLULayer, ReLUNode
+from switchmt_snn.spiking.neurons.surrogates import (
+    DEFAULT_SLOPE,
+    SURROGATES,
+    make_surrogate,
+    make_surrogate_gradient,
+)
+from switchmt_snn.spiking.neurons.synaptic import SynapticLayer, SynapticNode
+
+NEURONS: dict[str, type[NeuronLayer]] = {}
+"""Spiking neuron models by the name that ``network.neuron`` takes."""
+
+
+def register_neuron(name: str, model: type[NeuronLayer]) -> None:
+    """Add a model of this package under a name, which ``NetworkConfig.neuron`` lists too.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if name in NEURONS:
+        raise ValueError(f"neuron {name!r} is registered already, expected a new name")
+    NEURONS[name] = model
+
+
+register_neuron("IF", LeakyLayer)
+register_neuron("LIF", LeakyLayer)
+register_neuron("Synaptic", SynapticLayer)
+register_neuron("ALIF", AdaptiveLayer)
+
+
+def neuron_model(name: str) -> type[NeuronLayer]:
+    """The class of a neuron model: registered, or from outside (``package.module:Class``).
+
+    Raises:
+        ConfigError: no such model, or the class from outside is no :class:`NeuronLayer`.
+    """
+    if is_plugin(name):
+        model = load_plugin(name, "network.neuron")
+        if not (isinstance(model, type) and issubclass(model, NeuronLayer)):
+            raise ConfigError(
+                f"network.neuron is {name!r}, expected a subclass of switchmt_snn.spiking.neurons.NeuronLayer; "
+                "see docs/extending.md"
+            )
+        return model
+    if name not in NEURONS:
+        raise ConfigError(
+            f"network.neuron is {name!r}, expected one of {', '.join(NEURONS)} or package.module:Class"
+            f"{did_you_mean(name, NEURONS)}"
+        )
+    return NEURONS[name]
+
+
+def make_neuron_layer(config: NetworkConfig, spiking: bool) -> NeuronLayer:
+    """A new layer of the model that ``config.neuron`` names, or of ReLUs for an ANN method.
+
+    Raises:
+        ConfigError: see :func:`neuron_model`; or the model does not have a setting's value.
+    """
+    return (neuron_model(config.neuron) if spiking else ReLULayer)(config)
+
+
+__all__ = [
+    "DEFAULT_SLOPE",
+    "NEURONS",
+    "SURROGATES",
+    "AdaptiveLayer",
+    "AdaptiveNode",
+    "LeakyLayer",
+    "LeakyNode",
+    "NeuronLayer",
+    "NeuronState",
+    "OpaqueNode",
+    "ReLULayer",
+    "ReLUNode",
+    "SynapticLayer",
+    "SynapticNode",
+    "make_neuron_layer",
+    "make_surrogate",
+    "make_surrogate_gradient",
+    "neuron_model",
+    "register_neuron",
+]
