@@ -31,6 +31,7 @@ class PlainLoop(nn.Module):
         self.leaky = nn.ModuleList([snntorch.Leaky(**leaky) for _ in range(5)])
 
     def forward(self, x: Tensor) -> Tensor:
+        """Q-values ``[B, A]``, the mean over T steps."""
         membranes = [neuron.init_leaky() for neuron in self.leaky]  # type: ignore[operator]
         total: Tensor | float = 0.0
         for _ in range(self.timesteps):

@@ -69,6 +69,7 @@ class PeerUpdate:
             return module(inputs).float()  # type: ignore[no-any-return]
 
     def __call__(self) -> None:
+        """One update."""
         tensors = (torch.as_tensor(getattr(self.batch, field.name)).to(self.device) for field in fields(Batch))
         x, actions, rewards, x_next, terminated = tensors
         x, x_next = x.float() / 255, x_next.float() / 255
