@@ -54,10 +54,13 @@ class TrainingFailed(SwitchMTError):
     exit_code = 1
 
 
+def nearest(seen: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the nearest known name, or nothing if none is near."""
+    near = difflib.get_close_matches(seen, sorted(known), n=1, cutoff=0.6)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
 def did_you_mean(seen: str, known: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the nearest known name, or the list of known names if none is near."""
     names = sorted(known)
-    near = difflib.get_close_matches(seen, names, n=1, cutoff=0.6)
-    if near:
-        return f"; did you mean {near[0]!r}?"
-    return f"; known: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
+    return nearest(seen, names) or f"; known: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"

@@ -54,8 +54,7 @@ def configuration_page() -> str:
             "|---|---|---|---|",
         ]
         for key, kind, default, meaning in rows:
-            shown = kind.replace("|", "\\|").replace("Literal", "").replace("'", "")
-            lines.append(f"| `{key}` | {shown} | `{default}` | {meaning.replace('|', chr(92) + '|')} |")
+            lines.append(f"| `{key}` | {kind} | `{default}` | {meaning.replace('|', chr(92) + '|')} |")
     return "\n".join(lines) + "\n"
 
 

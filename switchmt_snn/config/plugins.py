@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import re
-from typing import Any
+from typing import Any, NewType
 
 from switchmt_snn.errors import ConfigError
 
-PluginName = str
-"""The type of a config value that may name a class from outside the package: ``Literal[...] | PluginName``."""
+PluginName = NewType("PluginName", str)
+"""A config value that names a class from outside the package: ``package.module:Name``."""
 
 _PLUGIN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
@@ -46,7 +46,7 @@ def load_plugin(name: str, key: str) -> Any:
         ) from None
 
 
-def plugin_name(plugin: type[Any], key: str) -> str:
+def plugin_name(plugin: type[Any], key: str) -> PluginName:
     """The ``package.module:Name`` by which :func:`load_plugin` finds a class again.
 
     Raises:
@@ -58,4 +58,4 @@ def plugin_name(plugin: type[Any], key: str) -> str:
             f"{key} is the local class {plugin.__qualname__!r}, expected a class at the top level of a module; a run "
             "stores its name, so that it can be resumed"
         )
-    return name
+    return PluginName(name)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from switchmt_snn.config.plugins import is_plugin, load_plugin
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.errors import ConfigError, nearest
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,7 @@ def require_suite_name(name: object) -> None:
 def unknown_suite(name: object) -> ConfigError:
     """The error for a value that ``tasks.suite`` does not take."""
     known = ", ".join(SUITE_DEFAULTS)
-    near = did_you_mean(str(name), SUITE_DEFAULTS)
-    hint = near if "did you mean" in near else ""
+    hint = nearest(str(name), SUITE_DEFAULTS)
     return ConfigError(f"tasks.suite is {name!r}, expected {known}, or a class as package.module:Name{hint}")
 
 

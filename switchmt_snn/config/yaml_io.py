@@ -1,26 +1,17 @@
-"""Strict YAML <-> config: an unknown key, a wrong type or a value out of range stops with one line.
-
-Also the documentation of every field, read from the source text of :mod:`switchmt_snn.config`.
-"""
+"""Strict YAML <-> config: an unknown key, a wrong type or a value out of range stops with one line."""
 
 from __future__ import annotations
 
-import ast
-import contextlib
 import dataclasses
 import importlib.resources
-import inspect
-import math
-import types
 import typing
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any
 
 import yaml
 
-from switchmt_snn.config import experiment as config_module
+from switchmt_snn.config.checks import field_types
 from switchmt_snn.config.experiment import ExperimentConfig
-from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError, did_you_mean
 
 
@@ -96,98 +87,14 @@ def _flatten(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _build(cls: type[Any], data: object, where: str, prefix: str) -> Any:
     if not isinstance(data, dict):
         raise ConfigError(f"{where}: {prefix.rstrip('.') or 'the file'} is {data!r}, expected a mapping of settings")
-    hints = typing.get_type_hints(cls)
+    fields = field_types(cls)
     values: dict[str, Any] = {}
     for key, value in data.items():
-        if key not in hints:
-            raise ConfigError(f"{where}: unknown key {prefix}{key}{did_you_mean(str(key), hints)}")
-        values[key] = _convert(hints[key], value, where, f"{prefix}{key}")
+        if key not in fields:
+            raise ConfigError(f"{where}: unknown key {prefix}{key}{did_you_mean(str(key), fields)}")
+        nested = dataclasses.is_dataclass(fields[key])
+        values[key] = _build(fields[key], value, where, f"{prefix}{key}.") if nested else value
     try:
         return cls(**values)
     except ConfigError as error:
-        raise error if str(error).startswith(where) else ConfigError(f"{where}: {error}") from None
-
-
-def _convert(hint: Any, value: Any, where: str, key: str) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return _build(typing.cast("type[Any]", hint), value, where, f"{key}.")
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        arms = get_args(hint)
-        if value is None and type(None) in arms:
-            return None
-        arms = tuple(arm for arm in arms if arm is not type(None))
-        if str in arms and is_plugin(value):  # Literal[...] | PluginName
-            return value
-        arms = tuple(arm for arm in arms if arm is not str) if len(arms) > 1 else arms
-        if all(get_origin(arm) is Literal for arm in arms):
-            return _choice(tuple(c for arm in arms for c in get_args(arm)), value, where, key)
-        return _convert(arms[0], value, where, key)
-    if origin is Literal:
-        return _choice(get_args(hint), value, where, key)
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where}: {key} is {value!r}, expected a list")
-        return tuple(_convert(get_args(hint)[0], item, where, key) for item in value)
-    return _scalar(hint, value, where, key)
-
-
-def _choice(choices: tuple[Any, ...], value: Any, where: str, key: str) -> Any:
-    if value not in choices:
-        names = [str(choice) for choice in choices]
-        hint = did_you_mean(str(value), names)
-        raise ConfigError(f"{where}: {key} is {value!r}, expected one of {', '.join(names)}{hint}")
-    return value
-
-
-def _scalar(kind: type[Any], value: Any, where: str, key: str) -> Any:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if kind is float and isinstance(value, str):
-        # YAML 1.1 reads 1e-4 (no dot) as text; a researcher means a number.
-        with contextlib.suppress(ValueError):
-            value = float(value)
-            is_number = True
-    if kind is float and is_number and math.isfinite(value):
-        return float(value)
-    if kind is int and is_number and math.isfinite(value) and float(value).is_integer():
-        return int(value)
-    if kind in (bool, str) and isinstance(value, kind):
-        return value
-    names = {int: "a whole number", float: "a finite number", bool: "true or false", str: "text"}
-    raise ConfigError(f"{where}: {key} is {value!r}, expected {names[kind]}")
-
-
-def field_documentation() -> list[tuple[str, str, list[tuple[str, str, str, str]]]]:
-    """Sections of the config as ``(prefix, section text, [(key, type, default, text)])``, in order.
-
-    Read from the source of :mod:`switchmt_snn.config`: the string under a field is its documentation.
-    """
-    tree = ast.parse(inspect.getsource(config_module))
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    sections = []
-    for prefix, cls in _sections():
-        node = classes[cls.__name__]
-        texts: dict[str, tuple[str, str]] = {}
-        for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
-            if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-                text = ""
-                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                    text = " ".join(str(after.value.value).split())
-                texts[statement.target.id] = (ast.unparse(statement.annotation), text)
-        rows = []
-        for item in dataclasses.fields(cls):
-            if not dataclasses.is_dataclass(typing.get_type_hints(cls)[item.name]):
-                annotation, text = texts[item.name]
-                rows.append((prefix + item.name, annotation, _shown(item.default), text))
-        sections.append((prefix.rstrip("."), inspect.getdoc(cls) or "", rows))
-    return sections
-
-
-def _shown(value: Any) -> str:
-    return yaml.safe_dump(list(value) if isinstance(value, tuple) else value, default_flow_style=True).split("\n")[0]
-
-
-def _sections() -> list[tuple[str, type[Any]]]:
-    hints = typing.get_type_hints(ExperimentConfig)
-    nested = [(f"{name}.", kind) for name, kind in hints.items() if dataclasses.is_dataclass(kind)]
-    return [("", ExperimentConfig), *typing.cast("list[tuple[str, type[Any]]]", nested)]
+        raise ConfigError(f"{where}: {error}") from None

@@ -14,8 +14,7 @@ import torch
 import yaml
 
 from switchmt_snn.cli import main
-from switchmt_snn.config import METHODS, POLICIES, ExperimentConfig
-from switchmt_snn.config.yaml_io import field_documentation
+from switchmt_snn.config import METHODS, POLICIES, ExperimentConfig, field_documentation
 from tests.spiking.test_network import TABLE_3
 
 ROOT = Path(__file__).parents[2]

@@ -137,8 +137,8 @@ def test_incomplete_suites_are_named() -> None:
         ExperimentConfig(tasks=TasksConfig(suite="tests.tasks.test_suites:Nameless", names=("a",)))
 
 
-@pytest.mark.parametrize("name", ["atary", "", "mujoco", 3])
-def test_an_unknown_suite_is_refused_and_the_known_ones_are_named(name: object) -> None:
+@pytest.mark.parametrize("name", ["atary", "", "mujoco"])
+def test_an_unknown_suite_is_refused_and_the_known_ones_are_named(name: str) -> None:
     with pytest.raises(ConfigError, match=r"expected atari, minatar, gym, or a class as package.module:Name"):
         TasksConfig(suite=name)  # type: ignore[arg-type]
 

@@ -1,0 +1,53 @@
+"""Settings of evaluations, and of what a run writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from switchmt_snn.config.checks import check_fields, require
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The evaluation protocol; it is printed beside every score."""
+
+    episodes: int = 30
+    """Episodes per task."""
+    epsilon: float = 0.05
+    """Share of random actions."""
+    seed: int = 10_000
+    """Seed of the evaluation's environments and random actions; separate from training."""
+    num_envs: int = 8
+    """Episodes played side by side."""
+    every_steps: int | None = None
+    """Also evaluate during training, every so many steps; null only at its end."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "evaluation")
+        require(self.episodes >= 1, "evaluation.episodes", self.episodes, "at least 1")
+        require(0.0 <= self.epsilon <= 1.0, "evaluation.epsilon", self.epsilon, "a probability in [0, 1]")
+        require(self.seed >= 0, "evaluation.seed", self.seed, "at least 0")
+        require(self.num_envs >= 1, "evaluation.num_envs", self.num_envs, "at least 1")
+        require(self.every_steps is None or self.every_steps >= 1, "evaluation.every_steps", self.every_steps, ">= 1")
+
+
+@dataclass(frozen=True)
+class RecordingConfig:
+    """What a run writes while it trains; none of it changes what is learned."""
+
+    checkpoint_every_steps: int = 50_000
+    """Agent steps between two checkpoints."""
+    keep_checkpoints: int = 2
+    """Newest checkpoints kept for resume (the best one is kept as weights besides)."""
+    metrics_every_steps: int = 1_000
+    """Agent steps between two rows of metrics.jsonl."""
+    tensorboard: bool = False
+    """Also write TensorBoard files (extra: tensorboard)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "recording")
+        require(
+            self.checkpoint_every_steps >= 1, "recording.checkpoint_every_steps", self.checkpoint_every_steps, ">= 1"
+        )
+        require(self.keep_checkpoints >= 1, "recording.keep_checkpoints", self.keep_checkpoints, "at least 1")
+        require(self.metrics_every_steps >= 1, "recording.metrics_every_steps", self.metrics_every_steps, "at least 1")

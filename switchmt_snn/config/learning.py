@@ -1,0 +1,98 @@
+"""Settings of double-DQN learning and of the replay memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from switchmt_snn.config.checks import check_fields, require
+
+Engine = Literal["eager", "native", "compiled", "graph"]
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Double-DQN learning and the replay memory (paper, Eq. 2 and Table 2)."""
+
+    batch_size: int = 512
+    """Transitions per update; all from one task."""
+    learning_rate: float = 1e-4
+    """Adam's learning rate."""
+    adam_epsilon: float = 1e-8
+    """Adam's epsilon."""
+    discount: float = 0.99
+    """Discount factor gamma."""
+    double_q: bool = True
+    """Choose the next action with the online network and value it with the target network (Eq. 2)."""
+    loss: Literal["mse", "huber"] = "mse"
+    """Squared error (paper), or Huber with delta 1."""
+    gradient_clip: Literal["none", "value", "norm"] = "none"
+    """Clamp each gradient element, or scale the whole gradient to a largest norm."""
+    gradient_clip_at: float = 1.0
+    """The bound of gradient_clip."""
+    precision: Literal["auto", "float32", "bfloat16"] = "float32"
+    """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
+    has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
+    engine: Literal["auto"] | Engine = "auto"
+    """Updates operation by operation (eager), in C++ (native: CPU; built once, some 7 s), compiled by torch.compile (20
+    to 35 s per start), or compiled into a CUDA graph; each rounds in its own way. auto, on a CPU with a C++ compiler:
+    native for the nature trunk (AVX-512 or bfloat16), compiled from 150,000 updates on; else eager."""
+    clip_rewards: bool = True
+    """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
+    replay_capacity_steps: int = 1_048_576
+    """Transitions kept per task."""
+    replay_compression: Literal["auto", "zstd", "none"] = "auto"
+    """Keep frames compressed, without loss and with the same samples. auto: if plain ones would take over 1 GiB."""
+    replay_max_gib: float = 4.0
+    """Compressed frames of all tasks together take no more; while they would, the oldest leave."""
+    replay_on_device: bool = False
+    """Keep frames as plain bytes where the network lies (a GPU's memory), so that batches are gathered there."""
+    learning_starts_steps: int = 512
+    """Transitions that a task must hold before it is sampled; until then its actions are random."""
+    update_every_steps: int = 1
+    """Agent steps between two updates."""
+    overlap: bool = False
+    """Step the environments on another thread while an update runs. An action is then chosen before the update of its
+    step instead of after it; else the loop is the same."""
+    update_tasks: Literal["current", "all"] = "current"
+    """Sample the current task's buffer (paper), or make one update from every task's buffer in turn (script)."""
+    target_update_every_steps: int = 10_000
+    """Agent steps between two copies of the network into the target network."""
+    epsilon_start: float = 1.0
+    """Exploration at the first step."""
+    epsilon_end: float = 0.1
+    """Exploration after the decay."""
+    epsilon_decay_steps: int = 1_000_000
+    """Steps of the linear decay from start to end."""
+    epsilon_clock: Literal["total", "task"] = "total"
+    """Count the decay in steps of the whole run (paper), or in steps of the task that is played."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "learning")
+        require(self.batch_size >= 2, "learning.batch_size", self.batch_size, "at least 2", "BatchNorm needs a batch")
+        require(self.learning_rate > 0, "learning.learning_rate", self.learning_rate, "above 0")
+        require(self.adam_epsilon > 0, "learning.adam_epsilon", self.adam_epsilon, "above 0")
+        require(0.0 <= self.discount <= 1.0, "learning.discount", self.discount, "within [0, 1]")
+        require(self.gradient_clip_at > 0, "learning.gradient_clip_at", self.gradient_clip_at, "above 0")
+        if self.replay_on_device:
+            require(self.replay_compression != "zstd", "learning.replay_compression", "zstd", "none on a device")
+        require(self.replay_max_gib > 0, "learning.replay_max_gib", self.replay_max_gib, "above 0")
+        for name in ("replay_capacity_steps", "update_every_steps", "target_update_every_steps", "epsilon_decay_steps"):
+            value = getattr(self, name)
+            require(value >= 1, f"learning.{name}", value, "at least 1")
+        require(
+            self.batch_size <= self.replay_capacity_steps,
+            "learning.batch_size",
+            self.batch_size,
+            f"at most replay_capacity_steps ({self.replay_capacity_steps})",
+            "lower the batch or raise the capacity",
+        )
+        require(
+            self.batch_size <= self.learning_starts_steps <= self.replay_capacity_steps,
+            "learning.learning_starts_steps",
+            self.learning_starts_steps,
+            f"between batch_size ({self.batch_size}) and replay_capacity_steps ({self.replay_capacity_steps})",
+        )
+        for name in ("epsilon_start", "epsilon_end"):
+            value = getattr(self, name)
+            require(0.0 <= value <= 1.0, f"learning.{name}", value, "a probability in [0, 1]")

@@ -1,0 +1,71 @@
+"""Settings of task switching."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from switchmt_snn.config.checks import check_fields, require
+from switchmt_snn.config.plugins import PluginName
+
+Policy = Literal[
+    "fixed_episodes",
+    "fixed_steps",
+    "interleave",
+    "parameter_change",
+    "parameter_change_per_update",
+    "reward_plateau",
+    "parameter_and_reward",
+]
+POLICIES: tuple[str, ...] = get_args(Policy)
+
+
+@dataclass(frozen=True)
+class SwitchingConfig:
+    """When training leaves a task (paper, Algorithm 1 and Eq. 3; docs/algorithm.md, Switching policies)."""
+
+    policy: Literal["auto"] | Policy | PluginName = "auto"
+    """fixed_episodes, fixed_steps, interleave, parameter_change (Eq. 3), parameter_change_per_update, reward_plateau or
+    parameter_and_reward; auto takes the method's own (SwitchMT: parameter_change, all others: fixed_episodes)."""
+    visit_episodes: int = 25
+    """fixed_episodes: episodes per visit."""
+    visit_steps: int = 10_000
+    """fixed_steps: leave at the first episode end after this many steps."""
+    window_episodes: int = 5
+    """K of Eq. 3: the parameter change is measured across this many episodes."""
+    change_threshold: float = 0.10
+    """parameter_change: leave when the relative change falls below this."""
+    change_rate_fraction: float = 0.5
+    """parameter_change_per_update: leave when the change per update is below this fraction of the visit's largest."""
+    plateau_window_episodes: int = 20
+    """reward_plateau: returns in the slope test."""
+    plateau_t: float = 1.0
+    """reward_plateau: a slope of fewer standard errors than this is not an improvement."""
+    plateau_patience_episodes: int = 3
+    """reward_plateau: leave after this many episode ends in a row without improvement (hysteresis)."""
+    min_stay_episodes: int = 0
+    """No policy leaves before this many episodes of the visit (the released script: 25)."""
+    min_stay_steps: int = 0
+    """No policy leaves before this many steps of the visit."""
+    max_stay_steps: int | None = None
+    """Leave at this many steps of the visit in any case, also within an episode; null never."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "switching")
+        for name in ("visit_episodes", "visit_steps", "window_episodes", "plateau_patience_episodes"):
+            value = getattr(self, name)
+            require(value >= 1, f"switching.{name}", value, "at least 1")
+        w = self.plateau_window_episodes
+        require(w >= 3, "switching.plateau_window_episodes", w, "at least 3", "a slope with an error needs 3 points")
+        require(self.change_threshold > 0, "switching.change_threshold", self.change_threshold, "above 0")
+        f = self.change_rate_fraction
+        require(0 < f < 1, "switching.change_rate_fraction", f, "within (0, 1)")
+        require(self.min_stay_episodes >= 0, "switching.min_stay_episodes", self.min_stay_episodes, "at least 0")
+        require(self.min_stay_steps >= 0, "switching.min_stay_steps", self.min_stay_steps, "at least 0")
+        if self.max_stay_steps is not None:
+            require(
+                self.max_stay_steps >= max(1, self.min_stay_steps),
+                "switching.max_stay_steps",
+                self.max_stay_steps,
+                f"at least 1 and at least min_stay_steps ({self.min_stay_steps})",
+            )

@@ -1,0 +1,52 @@
+"""Settings of the tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from switchmt_snn.config.checks import check_fields, require
+from switchmt_snn.config.suites import require_suite_name, suite_defaults
+
+
+@dataclass(frozen=True)
+class TasksConfig:
+    """Which tasks are learned, and how their environments are set up."""
+
+    suite: str = "atari"
+    """Where names are looked up: atari, minatar, gym (Gymnasium ids), or package.module:Name, a Suite of your own."""
+    names: tuple[str, ...] = ("pong", "breakout", "enduro")
+    """Tasks in the order in which training visits them. In the gym suite, module:MyEnv-v0 imports module first."""
+    num_envs: int = 1
+    """Copies of the current task that are stepped together; one vector step counts as this many agent steps."""
+    frame_stack: int | None = None
+    """Newest frames that form one observation; null takes the suite's number: atari 4, minatar and gym 1."""
+    frame_skip: int = 4
+    """Atari: emulator frames per agent step; the last two are max-pooled."""
+    sticky_action_probability: float = 0.0
+    """Atari and MinAtar: probability that the environment repeats the previous action instead of the new one."""
+    noop_max: int = 30
+    """Atari: an episode starts after 1 to this many no-op frames, drawn from the episode's seed."""
+    fire_on_reset: bool = True
+    """Atari: press FIRE once after a reset in games that wait for it (a greedy policy that never fires scores 0)."""
+    full_action_space: bool = True
+    """Atari: all 18 actions in every game, so that the tasks share one meaning per output."""
+    max_episode_frames: int = 108_000
+    """Atari and MinAtar: an episode is truncated after this many frames (in Atari 108,000 are 30 minutes of play)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "tasks")
+        require_suite_name(self.suite)
+        require(len(self.names) > 0, "tasks.names", self.names, "at least one task")
+        require(len(set(self.names)) == len(self.names), "tasks.names", self.names, "every task once")
+        require(self.num_envs >= 1, "tasks.num_envs", self.num_envs, "at least 1")
+        require(self.frame_stack is None or self.frame_stack >= 1, "tasks.frame_stack", self.frame_stack, ">= 1")
+        require(self.frame_skip >= 1, "tasks.frame_skip", self.frame_skip, "at least 1")
+        p = self.sticky_action_probability
+        require(0.0 <= p < 1.0, "tasks.sticky_action_probability", p, "a probability in [0, 1)")
+        require(self.noop_max >= 0, "tasks.noop_max", self.noop_max, "at least 0")
+        require(self.max_episode_frames >= 1, "tasks.max_episode_frames", self.max_episode_frames, "at least 1")
+
+
+def resolved_frame_stack(tasks: TasksConfig) -> int:
+    """Frames per observation; null takes the suite's default."""
+    return tasks.frame_stack or suite_defaults(tasks.suite).frame_stack
