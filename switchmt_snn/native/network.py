@@ -124,7 +124,8 @@ class NativeNetwork:
                 outputs, _ = self._outputs(x, view, training, beside, None)
         if self._is_mean:
             return list(outputs)
-        return [self._network.highest(self._network.integrate(output_TBA)) for output_TBA in outputs]
+        readout = self._network.readout
+        return [readout.q_values(readout.integrate(output_TBA)) for output_TBA in outputs]
 
     def _outputs(
         self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor], layers: list[Gradients] | None

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from switchmt_snn.config import NetworkConfig
+from switchmt_snn.spiking.settings import require_known
 
 
 class ActiveDendrites(nn.Module):
@@ -26,6 +27,7 @@ class ActiveDendrites(nn.Module):
     def __init__(self, config: NetworkConfig, num_neurons: int, num_tasks: int) -> None:
         """Draw the segments from N(0, 1), as the released script does."""
         super().__init__()
+        require_known("dendritic_gating", config.dendritic_gating, ("max", "absolute_max"))
         rows = num_neurons if config.dendrites == "per_neuron" else 1
         self.segments_NSK = nn.Parameter(torch.randn(rows, config.dendritic_segments, num_tasks))
         self.register_buffer("tasks_K", torch.arange(num_tasks), persistent=False)
@@ -48,6 +50,17 @@ class ActiveDendrites(nn.Module):
             index_N1 = responses_NS.abs().argmax(dim=1, keepdim=True)
             chosen_N = responses_NS.gather(1, index_N1).squeeze(1)
         return torch.sigmoid(chosen_N)
+
+
+def make_dendrites(config: NetworkConfig, num_neurons: int, num_tasks: int) -> ActiveDendrites | None:
+    """The dendrites that ``config.dendrites`` names; None for ``none``.
+
+    Raises:
+        ConfigError: another value, ``auto`` included.
+    """
+    known = ("none", "shared", "per_neuron")
+    require_known("dendrites", config.dendrites, known, "switchmt_snn.config.resolve replaces auto")
+    return None if config.dendrites == "none" else ActiveDendrites(config, num_neurons, num_tasks)
 
 
 def keep_k_winners(current: Tensor, k: int) -> Tensor:

@@ -17,7 +17,6 @@ first layer and its BatchNorm are computed once, since every step has the same i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import cast
 
@@ -27,10 +26,12 @@ from torch import Tensor, nn
 
 from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.spiking.dendrites import ActiveDendrites, keep_k_winners
+from switchmt_snn.spiking.dendrites import keep_k_winners, make_dendrites
 from switchmt_snn.spiking.encodings import Encoder
 from switchmt_snn.spiking.neurons import NeuronLayer, NeuronState, make_neuron_layer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
+from switchmt_snn.spiking.readout import make_readout
+from switchmt_snn.spiking.settings import require_known
 
 CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "nature": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
@@ -118,8 +119,7 @@ class Stream(nn.Module):
         super().__init__()
         hidden = cast(int, config.hidden_units)
         self.synapses = nn.Linear(num_features, hidden)
-        has_dendrites = config.dendrites in ("shared", "per_neuron")
-        self.dendrites = ActiveDendrites(config, hidden, num_tasks) if has_dendrites else None
+        self.dendrites = make_dendrites(config, hidden, num_tasks)
         self.k_winners = config.k_winners
         self.neurons = make_neuron_layer(config, spiking)
         self.head = nn.Linear(hidden, num_outputs)
@@ -154,6 +154,7 @@ class QNetwork(nn.Module):
         self.config = config
         self.observation = observation
         self.spiking = traits.spiking
+        self.readout = make_readout(config)
         self.encoder = Encoder(config, observation.frame_stack, observation.in_unit_range)
         self.trunk = nn.ModuleDict()
         shape = self._build_trunk()
@@ -168,6 +169,8 @@ class QNetwork(nn.Module):
     def _build_trunk(self) -> tuple[int, ...]:
         """Append the trunk's layers and return the shape of the last one's output."""
         config, observation = self.config, self.observation
+        require_known("trunk", config.trunk, CONVOLUTIONS, "switchmt_snn.config.resolve replaces auto")
+        require_known("normalization", config.normalization, ("per_task", "shared"))
         channels = self.encoder.input_channels(observation.shape[0])
         shape: tuple[int, ...] = (channels, *observation.shape[1:])
         if config.trunk == "mlp":
@@ -255,10 +258,10 @@ class QNetwork(nn.Module):
             x = self._fire(name, cast(TrunkLayer, layer), current, state, activity)
         features_TBN = x.flatten(2)
         outputs = {
-            name: self._readout(name, cast(Stream, stream), features_TBN, context[name], state, activity, precision)
+            name: self._read_out(name, cast(Stream, stream), features_TBN, context[name], state, activity, precision)
             for name, stream in self.streams.items()
         }
-        return self.highest(self.combine(outputs))
+        return self.readout.q_values(self.combine(outputs))
 
     def _over_time(self, current: Tensor) -> Tensor:
         """Repeat ``[1, B, ...]`` over T: direct encoding's first layer has the same current at every step."""
@@ -277,7 +280,7 @@ class QNetwork(nn.Module):
             activity[name] = spikes
         return cast(Tensor, spikes)
 
-    def _readout(
+    def _read_out(
         self,
         name: str,
         stream: Stream,
@@ -288,17 +291,7 @@ class QNetwork(nn.Module):
         precision: torch.dtype | None,
     ) -> Tensor:
         spikes_TBN = self._fire(name, stream, stream.current(features_TBN, context, precision), state, activity)
-        if self.config.readout == "mean":
-            return cast(Tensor, stream.head(spikes_TBN.mean(0)))
-        return self.integrate(stream.head(spikes_TBN))
-
-    def integrate(self, outputs_TBN: Tensor) -> Tensor:
-        """Membranes of the readout's neurons, which never fire, on a head's outputs: the last one ``[B, N]``, or all
-        ``[T, B, N]`` (max_membrane)."""
-        membranes = [outputs_TBN[0]]
-        for output_BN in outputs_TBN[1:]:
-            membranes.append(self.config.readout_beta * membranes[-1] + output_BN)
-        return membranes[-1] if self.config.readout == "last_membrane" else torch.stack(membranes)
+        return self.readout.stream(stream.head, spikes_TBN)
 
     def combine(self, outputs: dict[str, Tensor]) -> Tensor:
         """Q-values ``[..., A]`` from the streams' outputs ``[..., n]``."""
@@ -306,15 +299,6 @@ class QNetwork(nn.Module):
             return outputs["q"]
         advantage = outputs["advantage"]
         return outputs["value"] + advantage - advantage.mean(-1, keepdim=True)
-
-    def highest(self, q: Tensor) -> Tensor:
-        """Q-values ``[B, A]`` of those that :meth:`integrate` leaves."""
-        return q.amax(0) if self.config.readout == "max_membrane" else q
-
-    def neuron_layers(self) -> Iterator[str]:
-        """Names of the neuron layers in forward order, as used in ``activity`` and ``state``."""
-        yield from self.trunk
-        yield from self.streams
 
 
 def build_network(config: NetworkConfig, observation: ObservationSpec, seed: int) -> QNetwork:

@@ -23,6 +23,7 @@ from switchmt_snn.native.network import NativeNetwork
 from switchmt_snn.native.neurons import Currents, Neurons, batch_moments, scaled_images
 from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
 from switchmt_snn.spiking.neurons import LeakyLayer
+from switchmt_snn.spiking.readout import READOUTS
 from switchmt_snn.updates import choice as machine
 from tests.conftest import small_config
 
@@ -227,7 +228,7 @@ def decision(readout: str) -> tuple[QNetwork, NativeNetwork, Tensor]:
 
 
 @builds
-@pytest.mark.parametrize("readout", ["mean", "last_membrane", "max_membrane"])
+@pytest.mark.parametrize("readout", READOUTS)
 def test_a_decision_leaves_no_cycle_behind(readout: str) -> None:
     """Its memory is free at once, not when Python looks for cycles."""
     _, native, x = decision(readout)

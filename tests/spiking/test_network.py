@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import cast
+from typing import cast, get_args, get_type_hints
 
 import pytest
 import torch
@@ -20,6 +20,7 @@ from switchmt_snn.spiking.network import (
     build_network,
     trainable_parameters,
 )
+from switchmt_snn.spiking.readout import READOUTS
 
 ATARI = ObservationSpec((4, 84, 84), 4, 1 / 255, True, num_actions=18, num_tasks=3)
 SMALL = ObservationSpec((4, 10, 10), 4, 1.0, True, num_actions=6, num_tasks=3)
@@ -100,7 +101,7 @@ def combine(outputs: dict[str, Tensor]) -> Tensor:
 
 @pytest.mark.parametrize("method", TABLE_3)
 @pytest.mark.parametrize("encoding", ["direct", "rate", "latency", "frames", "events"])
-@pytest.mark.parametrize("readout", ["mean", "last_membrane", "max_membrane"])
+@pytest.mark.parametrize("readout", READOUTS)
 def test_folded_network_equals_plain_loop(method: str, encoding: str, readout: str) -> None:
     """In eval mode: weights are multiples of 1/64 and inputs of 1/4, so that folding may not even change rounding."""
     ann = method in ("DQN", "DQN_D")
@@ -144,7 +145,7 @@ def test_state_carries_a_decision_on() -> None:
     short(observation, 0, state=state, activity=first)
     short(observation, 0, state=state, activity=second)
     long(observation, 0, activity=whole)
-    for name in short.neuron_layers():
+    for name in first:
         assert torch.equal(whole[name], torch.cat([first[name], second[name]]))
 
 
@@ -170,6 +171,30 @@ def test_building_leaves_the_global_generator_alone() -> None:
     torch.manual_seed(0)
     network(seed=9)
     assert torch.equal(torch.rand(3), expected)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("readout", "median", "mean or last_membrane or max_membrane"),
+        ("trunk", "resnet", "nature or minatar or mlp; .*resolve replaces auto"),
+        ("trunk", "auto", "nature or minatar or mlp; .*resolve replaces auto"),
+        ("dendrites", "auto", "none or shared or per_neuron; .*resolve replaces auto"),
+        ("dendritic_gating", "min", "max or absolute_max"),
+        ("normalization", "none", "per_task or shared"),
+        ("neuron", "Izhikevich", "IF or LIF or Synaptic or ALIF"),
+    ],
+)
+def test_unknown_values_are_refused_by_name(key: str, value: str, expected: str) -> None:
+    """Also where a config was made without its own checks."""
+    config = resolve(ExperimentConfig(network=NetworkConfig(trunk="minatar"))).network
+    object.__setattr__(config, key, value)
+    with pytest.raises(ConfigError, match=f"network.{key} is '{value}', expected {expected}"):
+        build_network(config, SMALL, 0)
+
+
+def test_the_registry_of_readouts_and_the_config_know_the_same_names() -> None:
+    assert get_args(get_type_hints(NetworkConfig)["readout"]) == tuple(READOUTS)
 
 
 def test_convolutions_refuse_vectors() -> None:

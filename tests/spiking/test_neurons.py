@@ -292,11 +292,14 @@ def test_a_name_is_registered_once() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"neuron": "Izhikevich"}, "network.neuron is 'Izhikevich', expected one of IF, LIF, Synaptic, ALIF or"),
-        ({"neuron": "ALIF", "neuron_engine": "snntorch"}, "neuron_engine is 'snntorch', expected fused .* ALIF"),
+        ({"neuron": "Izhikevich"}, "network.neuron is 'Izhikevich', expected IF or LIF or Synaptic or ALIF; a class"),
+        (
+            {"neuron": "ALIF", "neuron_engine": "snntorch"},
+            "'snntorch', expected fused; network.neuron is ALIF",
+        ),
         ({"neuron_engine": "eager"}, "network.neuron_engine is 'eager', expected fused or snntorch"),
         ({"reset": "none"}, "network.reset is 'none', expected zero or subtract"),
-        ({"surrogate": "atam"}, "network.surrogate is 'atam', expected one of .*; did you mean 'atan'?"),
+        ({"surrogate": "atam"}, "network.surrogate is 'atam', expected atan or .*; did you mean 'atan'?"),
     ],
 )
 def test_unknown_values_are_refused_by_name(settings: dict[str, str], message: str) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.plugins import is_plugin, load_plugin
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.neurons.adaptive import AdaptiveLayer, AdaptiveNode
 from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState, OpaqueNode
 from switchmt_snn.spiking.neurons.leaky import LeakyLayer, LeakyNode
@@ -25,6 +25,7 @@ from switchmt_snn.spiking.neurons.surrogates import (
     make_surrogate_gradient,
 )
 from switchmt_snn.spiking.neurons.synaptic import SynapticLayer, SynapticNode
+from switchmt_snn.spiking.settings import require_known
 
 NEURONS: dict[str, type[NeuronLayer]] = {}
 """Spiking neuron models by the name that ``network.neuron`` takes."""
@@ -61,11 +62,7 @@ def neuron_model(name: str) -> type[NeuronLayer]:
                 "see docs/extending.md"
             )
         return model
-    if name not in NEURONS:
-        raise ConfigError(
-            f"network.neuron is {name!r}, expected one of {', '.join(NEURONS)} or package.module:Class"
-            f"{did_you_mean(name, NEURONS)}"
-        )
+    require_known("neuron", name, NEURONS, "a class from outside is named package.module:Class")
     return NEURONS[name]
 
 

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.plugins import plugin_name
-from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.layers import NeuronNode
 from switchmt_snn.spiking.neurons.surrogates import make_surrogate
+from switchmt_snn.spiking.settings import require_known
 
 NeuronState = tuple[Tensor, ...]
 """State variables ``[B, ...]`` of a layer, in the order of :attr:`NeuronLayer.STATE`."""
@@ -72,14 +72,8 @@ class NeuronLayer(nn.Module):
             ConfigError: ``config.neuron_engine`` or ``config.reset`` is a value that the model does not have.
         """
         super().__init__()
-        for key, seen, known in (
-            ("neuron_engine", config.neuron_engine, self.ENGINES),
-            ("reset", config.reset, RESETS),
-        ):
-            if seen not in known:
-                raise ConfigError(
-                    f"network.{key} is {seen!r}, expected {' or '.join(known)} for network.neuron {config.neuron}"
-                )
+        require_known("neuron_engine", config.neuron_engine, self.ENGINES, f"network.neuron is {config.neuron}")
+        require_known("reset", config.reset, RESETS)
         self.surrogate = make_surrogate(config.surrogate, config.surrogate_slope)
 
     def initial_state(self, current_t: Tensor) -> NeuronState:

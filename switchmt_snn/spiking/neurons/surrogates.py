@@ -12,7 +12,7 @@ import torch
 from snntorch import surrogate as snntorch_surrogate
 from torch import Tensor
 
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.spiking.settings import require_known
 
 Surrogate = Callable[[Tensor], Tensor]
 """``U - theta -> S``: 1.0 where the argument is above 0, else 0.0; differentiable by the surrogate."""
@@ -46,10 +46,7 @@ def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
     Raises:
         ConfigError: ``name`` is not in :data:`SURROGATES`.
     """
-    if name not in SURROGATES:
-        raise ConfigError(
-            f"network.surrogate is {name!r}, expected one of {', '.join(SURROGATES)}{did_you_mean(name, SURROGATES)}"
-        )
+    require_known("surrogate", name, SURROGATES)
     argument = SURROGATES[name]
     arguments = {} if slope is None or argument is None else {argument: slope}
     surrogate: Surrogate = getattr(snntorch_surrogate, name)(**arguments)
