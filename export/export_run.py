@@ -15,8 +15,8 @@ import onnx
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
-from switchmt_snn.export.folding import FoldedNetwork, fold, metadata, quantized
-from switchmt_snn.export.formats.nir_writer import NirProfile, can_express, nir_graph, write_nir
+from switchmt_snn.export.folded import fold_agent, metadata
+from switchmt_snn.export.formats.nir_writer import DIALECT_KEY, NirDialect, can_express, nir_graph, write_nir
 from switchmt_snn.export.formats.onnx_writer import OPSET, decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
@@ -26,6 +26,7 @@ from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAge
 from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
+from switchmt_snn.spiking.folding import FoldedNetwork, quantized
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -56,7 +57,7 @@ class ExportSettings:
         nir: one ``<task>.nir`` and ``<task>.json`` per task.
         tasks: also one ``decision_<task>.onnx`` for each of these.
         int8: store the weights as 8-bit integers with one step per output channel.
-        nir_profile: see :mod:`switchmt_snn.export.formats.nir_writer`.
+        nir_dialect: see :mod:`switchmt_snn.export.formats.nir_writer`.
         parity_decisions: recorded decisions per task that the files are compared on.
     """
 
@@ -64,7 +65,7 @@ class ExportSettings:
     nir: bool = False
     tasks: tuple[str, ...] = ()
     int8: bool = False
-    nir_profile: NirProfile = "portable"
+    nir_dialect: NirDialect = "portable"
     parity_decisions: int = 1000
 
 
@@ -98,10 +99,10 @@ def export(
     run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
-    network = fold(agent)
+    network = fold_agent(agent)
     exported = quantized(network) if settings.int8 else network
     if not settings.onnx and not settings.nir:
-        settings = replace(settings, onnx=True, nir=can_express(network, settings.nir_profile))
+        settings = replace(settings, onnx=True, nir=can_express(network, settings.nir_dialect))
     folder = Path(out) if out is not None else run_folder.path / "export"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -115,7 +116,7 @@ def export(
     if settings.onnx:
         files |= _write_onnx(exported, folder, specialised, facts)
     if settings.nir:
-        files |= _write_nir(exported, folder, settings.nir_profile, facts)
+        files |= _write_nir(exported, folder, settings.nir_dialect, facts)
     for name, path in files.items():
         note(f"wrote {path} ({name})")
     written_at = time.perf_counter()
@@ -148,7 +149,7 @@ def _write_onnx(
     if network.spiking:
         models["step"] = step_model(network)
     for task in specialised:
-        models[f"decision_{file_name(task)}"] = decision_model(network, network.suite.index(task))
+        models[f"decision_{file_name(task)}"] = decision_model(network, network.task_index(task))
     files = {}
     for name, model in models.items():
         for key, value in (facts | {"opset": str(OPSET)}).items():
@@ -160,10 +161,10 @@ def _write_onnx(
     return files
 
 
-def _write_nir(network: FoldedNetwork, folder: Path, profile: NirProfile, facts: dict[str, Any]) -> dict[str, Path]:
+def _write_nir(network: FoldedNetwork, folder: Path, dialect: NirDialect, facts: dict[str, Any]) -> dict[str, Path]:
     files = {}
-    for index, task in enumerate(network.suite.names):
-        graph = nir_graph(network, index, profile)
+    for index, task in enumerate(network.tasks):
+        graph = nir_graph(network, index, dialect)
         graph.metadata.update(facts)
         path = folder / f"{file_name(task)}.nir"
         temporary = path.with_suffix(".tmp.nir")
@@ -172,7 +173,7 @@ def _write_nir(network: FoldedNetwork, folder: Path, profile: NirProfile, facts:
             temporary.rename(path)
         finally:
             temporary.unlink(missing_ok=True)
-        beside = metadata(network) | facts | {"task": task, "profile": profile, "dt": graph.metadata["dt"]}
+        beside = metadata(network) | facts | {"task": task, DIALECT_KEY: dialect, "dt": graph.metadata["dt"]}
         write_atomically(path.with_suffix(".json"), json.dumps(beside, indent=1).encode())
         files[path.name] = path
     return files
@@ -180,7 +181,7 @@ def _write_nir(network: FoldedNetwork, folder: Path, profile: NirProfile, facts:
 
 def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
     """What lies on the disk; that, and nothing in memory, is compared."""
-    names = network.suite.names
+    names = network.tasks
     graphs = {name: read_nir(files[key]) for name in names if (key := f"{file_name(name)}.nir") in files}
     own = {name: files[key].read_bytes() for name in names if (key := f"decision_{file_name(name)}.onnx") in files}
     decision, step = (files[key].read_bytes() if key in files else None for key in ("decision.onnx", "step.onnx"))

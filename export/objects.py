@@ -14,13 +14,14 @@ import torch
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.folding import FoldedNetwork, fold, quantized
-from switchmt_snn.export.formats.nir_writer import NirProfile, can_express, nir_graph
+from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.export.formats.nir_writer import NirDialect, can_express, nir_graph
 from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.recording import play
 from switchmt_snn.runs.run import load_agent
+from switchmt_snn.spiking.folding import FoldedNetwork, fold, quantized
 from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite
 
@@ -44,31 +45,31 @@ def to_onnx(
         TaskError: unknown task.
     """
     network = _folded(source, int8)
-    index = None if task is None else network.suite.index(task)
+    index = None if task is None else network.task_index(task)
     return decision_model(network, index) if kind == "decision" else step_model(network, index)
 
 
-def to_nir(source: Source, task: str, profile: NirProfile = "portable", int8: bool = False) -> nir.NIRGraph:
+def to_nir(source: Source, task: str, dialect: NirDialect = "portable", int8: bool = False) -> nir.NIRGraph:
     """One task of a network as a NIR graph; :func:`write_nir` writes it.
 
     Args:
         source: see :data:`Source`.
         task: whose statistics and gains are folded in.
-        profile: see :mod:`switchmt_snn.export.formats.nir_writer`.
+        dialect: see :mod:`switchmt_snn.export.formats.nir_writer`.
         int8: weights rounded to 8 bits (stored as float32; NIR has no integers).
 
     Raises:
-        ExportError: the profile cannot express the network exactly; the message names one that can.
+        ExportError: the dialect cannot express the network exactly; the message names one that can.
         TaskError: unknown task.
     """
     network = _folded(source, int8)
-    return nir_graph(network, network.suite.index(task), profile)
+    return nir_graph(network, network.task_index(task), dialect)
 
 
 def check_parity(
     source: Source,
     observations: dict[str, npt.NDArray[Any]] | None = None,
-    profile: NirProfile = "portable",
+    dialect: NirDialect = "portable",
     int8: bool = False,
 ) -> dict[str, Any]:
     """Export in memory, in every format that can express the network, and compare with it.
@@ -77,19 +78,19 @@ def check_parity(
         source: see :data:`Source`.
         observations: raw observations ``[N, *shape]`` by task; None plays 1,000 decisions of each (not for a bare
             network, which has no games).
-        profile: NIR profile.
+        dialect: NIR dialect.
         int8: compare a network with rounded weights.
 
     Returns:
         What ``parity.json`` holds; ``failures`` is empty if everything agrees as it must.
     """
     agent = _agent(source)
-    network = fold(agent)
+    network = fold_agent(agent)
     exported = quantized(network) if int8 else network
     names = agent.suite.names
     graphs = None
-    if can_express(network, profile):
-        graphs = {name: nir_graph(exported, k, profile) for k, name in enumerate(names)}
+    if can_express(network, dialect):
+        graphs = {name: nir_graph(exported, k, dialect) for k, name in enumerate(names)}
     step = step_model(exported).SerializeToString() if network.spiking else None
     written = Exports(exported, decision_model(exported).SerializeToString(), step, graphs)
     if observations is None:
@@ -104,7 +105,7 @@ def check_parity(
 
 
 def _folded(source: Source, int8: bool) -> FoldedNetwork:
-    network = fold(_agent(source))
+    network = fold(source) if isinstance(source, QNetwork) else fold_agent(_agent(source))
     return quantized(network) if int8 else network
 
 

@@ -24,7 +24,7 @@ from switchmt_snn.export.counts.network import TaskCounter, TaskProfile
 from switchmt_snn.export.counts.nir_file import profile_nir
 from switchmt_snn.export.energy.estimate import Energy, Target, estimate
 from switchmt_snn.export.energy.traffic import ann_traffic, traffic
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report.page import Frames, render_report
@@ -82,7 +82,7 @@ def profile(
     selection = Selection.of(targets)
     run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(run_folder.path, checkpoint, "cpu")
-    network = fold(agent)  # refuses weights that are not finite before anything is played
+    network = fold_agent(agent)  # refuses weights that are not finite before anything is played
     if not network.spiking:
         selection = Selection(tuple(t for t in selection.targets if "mac" in t.operations_pj), ())
     folder = _folder(Path(out) if out is not None else run_folder.path / "profile")

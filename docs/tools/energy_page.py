@@ -15,7 +15,7 @@ from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.mappings import CorePerLayer
 from switchmt_snn.export.chips.rules import RULES
 from switchmt_snn.export.energy.estimate import Target, builtin_targets
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite
@@ -144,7 +144,7 @@ def paper_part() -> str:
     config = resolve(load_config("paper"))
     suite = make_suite(config.tasks)
     network = build_network(config.network, observation_spec(suite), 0)
-    shapes = layer_shapes(fold(Agent(network, suite, config, torch.device("cpu"), 0)))
+    shapes = layer_shapes(fold_agent(Agent(network, suite, config, torch.device("cpu"), 0)))
     rows = []
     for name in builtin_chips():
         fit = check_fit(shapes, name)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import singledispatch
 from itertools import groupby
 from typing import Any
 
@@ -17,7 +18,8 @@ from switchmt_snn.export.chips.chip import Chip
 from switchmt_snn.export.chips.chip_file import load_chip
 from switchmt_snn.export.chips.limits import Limit
 from switchmt_snn.export.chips.shapes import LayerShape
-from switchmt_snn.export.folding import FoldedNetwork
+from switchmt_snn.spiking.folding import FoldedNetwork
+from switchmt_snn.spiking.layers import Conv, Dense, SynapseNode, no_rule
 
 ONE_TASK = "one task at a time: gains and BatchNorm are in the weights, and another task means loading others"
 
@@ -100,33 +102,64 @@ def layer_shapes(network: FoldedNetwork) -> tuple[LayerShape, ...]:
     This is the only function of this package that reads a network's description for its shapes.
 
     Raises:
-        ExportError: a kernel is not square.
+        ExportError: a kernel is not square, or has padding.
     """
     shapes: list[LayerShape] = []
     sees_spikes, sees = network.sees_spikes, network.encoded_shape
-    for layer in network.layers:
-        kernel = layer.weight.shape[2:] if layer.is_convolution else None
-        if kernel is not None and kernel[0] != kernel[1]:
-            raise ExportError(
-                f"{layer.name} has a kernel of {kernel[0]} x {kernel[1]}, expected a square one for chips"
-            )
-        streams = ("/value", "/advantage") if layer.groups == 2 else ("",)
+    neurons = [*(layer.neurons.kind for layer in network.layers), None]
+    for node, neuron in zip(network.synapses, neurons, strict=True):
+        image = sees if len(sees) == 3 else None
         shapes += [
-            LayerShape(
-                name=layer.name + stream,
-                input_shape=layer.input_shape,
-                output_shape=(layer.output_shape[0] // len(streams), *layer.output_shape[1:]),
-                kernel=None if kernel is None else kernel[0],
-                stride=layer.stride or 1,
-                weights=layer.weight.size // len(streams),
-                spiking_input=sees_spikes,
-                neuron=None if layer.neurons is None else layer.neurons.kind,
-                input_image=sees if len(sees) == 3 else None,
-            )
-            for stream in streams
+            replace(shape, spiking_input=sees_spikes, neuron=neuron, input_image=image) for shape in _shapes(node)
         ]
-        sees_spikes, sees = network.spiking, layer.output_shape
+        sees_spikes, sees = network.spiking, node.output_shape
     return tuple(shapes)
+
+
+@singledispatch
+def _shapes(node: SynapseNode) -> list[LayerShape]:
+    """Shapes of a node's layers, on inputs that are values, before any neurons."""
+    raise no_rule("the fit of chips", node, _shapes.registry, "add a rule to export/chips/fit.py")
+
+
+@_shapes.register
+def _(node: Conv) -> list[LayerShape]:
+    stride, kernel = node.stride, node.weight.shape[2:]
+    if stride[0] != stride[1] or kernel[0] != kernel[1] or node.padding != (0, 0):
+        raise ExportError(
+            f"{node.name} has a kernel of {kernel[0]} x {kernel[1]}, stride {stride} and padding {node.padding}, "
+            "expected square ones without padding for chips"
+        )
+    return [
+        LayerShape(
+            name=node.name,
+            input_shape=node.input_shape,
+            output_shape=node.output_shape,
+            kernel=kernel[0],
+            stride=stride[0],
+            weights=node.weight.size,
+            spiking_input=False,
+            neuron=None,
+        )
+    ]
+
+
+@_shapes.register
+def _(node: Dense) -> list[LayerShape]:
+    streams = ("/value", "/advantage") if node.groups == 2 else ("",)
+    return [
+        LayerShape(
+            name=node.name + stream,
+            input_shape=node.input_shape,
+            output_shape=(node.output_shape[0] // len(streams),),
+            kernel=None,
+            stride=1,
+            weights=node.weight.size // len(streams),
+            spiking_input=False,
+            neuron=None,
+        )
+        for stream in streams
+    ]
 
 
 def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:

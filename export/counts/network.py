@@ -1,7 +1,8 @@
 """What a network does while it plays: spikes and operations by layer, step and task, counted on recorded decisions.
 
 Counted is the network as it is deployed: one task folded in, the head fed with every step's spikes, the first layer
-computed once per decision under direct encoding (its input does not change). Definitions: :mod:`export.counting`.
+computed once per decision under direct encoding (its input does not change). Definitions:
+:mod:`switchmt_snn.export.counts.synapses`.
 
 Twins stand beside it: the ANN of the same shape does one multiplication per weight and position (dense), and the
 quantised ANN does the same on activations of ceil(log2(T + 1)) bits, as many values as a spike count over T can take.
@@ -10,7 +11,7 @@ quantised ANN does the same on activations of ceil(log2(T + 1)) bits, as many va
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ import numpy.typing as npt
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.counts.synapses import NeuronCounter, SynapseCounter, Synapses
-from switchmt_snn.export.folding import FoldedNetwork, Layer, fold
+from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.parity.activity import active_neurons, chunks
 from switchmt_snn.export.runtimes.agents import encode
+from switchmt_snn.spiking.folding import FoldedNetwork
+from switchmt_snn.spiking.layers import Dense, SynapseNode
 
 
 @dataclass(frozen=True)
@@ -172,12 +175,10 @@ class TaskCounter:
 
     def __init__(self, agent: Agent, task: int) -> None:
         """Start at nothing; ``task`` is a task's index."""
-        self.agent, self.task, self.network = agent, task, fold(agent)
-        self._synapses = [SynapseCounter(_synapses(self.network, layer, task)) for layer in self.network.layers]
-        self._steps = agent.config.network.timesteps
-        self._neurons = [
-            NeuronCounter(layer.name, layer.output_shape, self._steps) for layer in self.network.hidden_layers
-        ]
+        self.agent, self.task, self.network = agent, task, fold_agent(agent)
+        self._synapses = [SynapseCounter(_counted(self.network, node, task)) for node in self.network.synapses]
+        self._steps = self.network.settings.timesteps
+        self._neurons = [NeuronCounter(layer.name, layer.output_shape, self._steps) for layer in self.network.layers]
         self._chunks = 0
 
     def add(self, observations: npt.NDArray[Any]) -> None:
@@ -192,7 +193,7 @@ class TaskCounter:
                 f"the recorded observations have shape {observations.shape}, expected "
                 f"(N, {', '.join(map(str, expected))}) with N >= 1; record them again"
             )
-        once = self.agent.config.network.encoding == "direct"
+        once = self.network.constant_input
         for chunk in chunks(observations):
             # Each chunk has random numbers of its own, for random encodings.
             encoded_TB = encode(self.agent.suite, self.agent.config, chunk, self._chunks)
@@ -209,9 +210,9 @@ class TaskCounter:
         neurons: list[NeuronCounter | None] = [*self._neurons, None]
         layers = tuple(
             _layer_profile(self.network, *parts)
-            for parts in zip(self.network.layers, self._synapses, neurons, strict=True)
+            for parts in zip(self.network.synapses, self._synapses, neurons, strict=True)
         )
-        name, decisions = self.agent.suite.names[self.task], self._synapses[0].decisions
+        name, decisions = self.network.tasks[self.task], self._synapses[0].decisions
         return TaskProfile(name, decisions, self._steps, self.network.spiking, layers)
 
 
@@ -226,15 +227,12 @@ def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> Tas
     return counter.profile()
 
 
-def _synapses(network: FoldedNetwork, layer: Layer, task: int) -> Synapses:
-    first = layer is network.layers[0]
-    spikes_in = network.sees_spikes if first else network.spiking
-    weight, _ = layer.folded(task)
-    stride = layer.stride or 1
-    shape = layer.input_shape
-    if not layer.is_convolution and len(shape) > 1:  # an image into a linear layer
-        shape = (int(np.prod(shape)),)
-    return Synapses(layer.name, weight, shape, spikes_in, stride=(stride, stride))
+def _counted(network: FoldedNetwork, node: SynapseNode, task: int) -> CountedSynapses:
+    """A layer's synapses with the weights of one task, as they are deployed."""
+    spikes_in = network.sees_spikes if node is network.synapses[0] else network.spiking
+    weight, _ = node.folded(task)
+    deployed = replace(node, weight=weight.astype(np.float64), scale_KO=np.ones_like(node.scale_KO))
+    return CountedSynapses(deployed, spikes_in)
 
 
 def layer_profile(
@@ -250,15 +248,15 @@ def layer_profile(
         gain_multiplications: per decision.
     """
     return LayerProfile(
-        name=counter.synapses.name,
-        convolution=counter.synapses.weight.ndim == 4,
+        name=counter.synapses.node.name,
+        convolution=counter.synapses.shares_weights,
         operation=counter.synapses.operation,
         decisions=counter.decisions,
         effective_T=tuple(counter.operations_T.tolist()),
         active_inputs_T=tuple(counter.active_inputs_T.tolist()),
         inputs=len(counter.fan_out),
         dense_per_decision=counter.synapses.dense_operations() * len(counter.operations_T),
-        weights=int(np.count_nonzero(counter.synapses.weight)),
+        weights=int(np.count_nonzero(counter.synapses.node.weight)),
         outputs=outputs,
         neurons=outputs if neurons is not None else 0,
         spikes_T=tuple(neurons.spikes_TN.sum(axis=1).tolist()) if neurons is not None else (),
@@ -271,9 +269,9 @@ def layer_profile(
 
 
 def _layer_profile(
-    network: FoldedNetwork, layer: Layer, counter: SynapseCounter, neurons: NeuronCounter | None
+    network: FoldedNetwork, node: SynapseNode, counter: SynapseCounter, neurons: NeuronCounter | None
 ) -> LayerProfile:
-    steps, outputs = network.config.network.timesteps, int(np.prod(layer.output_shape))
-    gated = network.config.network.dendrites in ("shared", "per_neuron") and layer.name == "hidden"
-    updates = outputs * steps if network.spiking and neurons is not None else 0
-    return layer_profile(counter, neurons, outputs, updates, outputs * steps if gated else 0)
+    steps = network.settings.timesteps
+    updates = node.outputs * steps if network.spiking and neurons is not None else 0
+    gains = node.outputs * steps if isinstance(node, Dense) and node.gated else 0
+    return layer_profile(counter, neurons, node.outputs, updates, gains)

@@ -2,7 +2,7 @@
 
 An ``.npz`` file holds the inputs: raw ``observations`` for a graph with this package's metadata, which says how to
 encode them, or encoded ``inputs`` for anybody's graph. A layer is a node with weights and the spiking node that it
-feeds; what is counted, and how often, is as in :mod:`export.profile`.
+feeds; what is counted, and how often, is as in :mod:`switchmt_snn.export.counts.network`.
 
 Shapes: T simulation steps, N decisions, B batch, ... a node's own shape.
 """
@@ -24,12 +24,13 @@ import torch
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.counts.network import LayerProfile, TaskProfile, layer_profile
-from switchmt_snn.export.counts.synapses import NeuronCounter, SynapseCounter, Synapses
-from switchmt_snn.export.folding import SPIKE_ENCODINGS
+from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.spiking.encodings import Encoder
+from switchmt_snn.spiking.folding import SPIKE_ENCODINGS
+from switchmt_snn.spiking.layers import Conv, Dense, convolved_sides
 
 _SYNAPTIC = (nir.Conv2d, nir.Affine, nir.Linear)
 _SPIKING = (nir.IF, nir.LIF, nir.Threshold)
@@ -143,9 +144,9 @@ def _layers(interpreter: NirInterpreter, inputs: _Inputs) -> list[_Layer]:
     for name in interpreter.order:
         if isinstance(nodes[name], _SYNAPTIC):
             synapses, source = _synapses(interpreter, name, inputs)
-            outputs = _outputs(interpreter, name)
-            neurons = NeuronCounter(fed[name], outputs, inputs.timesteps) if name in fed else None
-            layers.append(_Layer(SynapseCounter(synapses), source, int(np.prod(outputs)), fed.get(name), neurons))
+            node = synapses.node
+            neurons = NeuronCounter(fed[name], node.output_shape, inputs.timesteps) if name in fed else None
+            layers.append(_Layer(SynapseCounter(synapses), source, node.outputs, fed.get(name), neurons))
     return layers
 
 
@@ -166,7 +167,7 @@ def _feeding(interpreter: NirInterpreter, spiking: str) -> str:
     return min(found, key=interpreter.order.index)
 
 
-def _synapses(interpreter: NirInterpreter, name: str, inputs: _Inputs) -> tuple[Synapses, str]:
+def _synapses(interpreter: NirInterpreter, name: str, inputs: _Inputs) -> tuple[CountedSynapses, str]:
     """A node's synapses, and the node that it hears through Flatten."""
     nodes, source = interpreter.graph.nodes, name
     while source == name or isinstance(nodes[source], nir.Flatten):
@@ -175,9 +176,25 @@ def _synapses(interpreter: NirInterpreter, name: str, inputs: _Inputs) -> tuple[
             raise ExportError(f"the NIR node {source} adds up {', '.join(sources)}, expected one source before weights")
         (source,) = sources
     spikes_in = inputs.spikes if source == interpreter.input else isinstance(nodes[source], _SPIKING)
-    shape = _sides(nodes[name].input_type["input"])
-    stride, padding = interpreter.geometry.get(name, ((1, 1), (0, 0)))
-    return Synapses(name, nodes[name].weight, shape, spikes_in, stride=stride, padding=padding), source
+    return CountedSynapses(_described(interpreter, name), spikes_in), source
+
+
+def _described(interpreter: NirInterpreter, name: str) -> Conv | Dense:
+    """A node with weights as this package describes it; counting has no use for its bias."""
+    node = interpreter.graph.nodes[name]
+    nothing = np.zeros((1, len(node.weight)))
+    facts: dict[str, Any] = {
+        "name": name,
+        "weight": node.weight,
+        "scale_KO": nothing + 1.0,
+        "shift_KO": nothing,
+        "input_shape": _sides(node.input_type["input"]),
+        "output_shape": _outputs(interpreter, name),
+    }
+    if name not in interpreter.geometry:
+        return Dense(**facts)
+    stride, padding = interpreter.geometry[name]
+    return Conv(**facts, stride=stride, padding=padding)
 
 
 def _outputs(interpreter: NirInterpreter, name: str) -> tuple[int, ...]:
@@ -187,13 +204,7 @@ def _outputs(interpreter: NirInterpreter, name: str) -> tuple[int, ...]:
     if name not in interpreter.geometry:
         return stated
     image, kernel = _sides(node.input_type["input"])[1:], node.weight.shape[2:]
-    computed = (
-        len(node.weight),
-        *(
-            (side + 2 * pad - reach) // step + 1
-            for side, reach, step, pad in zip(image, kernel, *interpreter.geometry[name], strict=True)
-        ),
-    )
+    computed = (len(node.weight), *convolved_sides(image, kernel, *interpreter.geometry[name]))
     if computed != stated or min(computed) < 1:  # nir 1.0.8 takes every kernel for a square
         raise ExportError(
             f"the NIR node {name} has output shape {list(stated)}, expected {list(computed)} of a kernel of "

@@ -13,61 +13,90 @@ Shapes: T simulation steps, B batch (decisions), O output and I input channels o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import singledispatch
 
 import numpy as np
 import numpy.typing as npt
+
+from switchmt_snn.spiking.layers import Conv, Dense, SynapseNode, no_rule
 
 Int = npt.NDArray[np.int64]
 
 RATE_BINS = 20
 """Ranges of firing rates that a distribution is told in."""
+_REMEDY = "add a rule to export/counts/synapses.py"
 
 
 @dataclass(frozen=True)
-class Synapses:
-    """What counting needs of a layer of synapses.
+class CountedSynapses:
+    """Synapses and what comes in.
 
     Attributes:
-        weight: ``[O, I, kh, kw]`` of a convolution or ``[O, I]`` of a linear layer.
-        input_shape: ``(I, H, W)`` or ``(I,)``.
-        stride: of a convolution, ``(vertical, horizontal)``.
-        padding: of a convolution, ``(vertical, horizontal)``.
+        node: the synapses.
         spiking_input: whether inputs are spikes.
     """
 
-    name: str
-    weight: npt.NDArray[np.floating]
-    input_shape: tuple[int, ...]
+    node: SynapseNode
     spiking_input: bool
-    stride: tuple[int, int] = (1, 1)
-    padding: tuple[int, int] = (0, 0)
 
     @property
     def operation(self) -> str:
         """``AC`` or ``MAC``."""
         return "AC" if self.spiking_input else "MAC"
 
+    @property
+    def shares_weights(self) -> bool:
+        """Whether a weight is used at several positions (a convolution)."""
+        return shares_weights(self.node)
+
     def fan_out(self) -> Int:
         """Non-zero weights that each input meets, of the input's shape."""
-        return self._fan_out((self.weight != 0).astype(np.int64))
+        return _fan_out(self.node, (self.node.weight != 0).astype(np.int64))
 
     def dense_operations(self) -> int:
         """Operations of one pass with every input and every weight counted."""
-        return int(self._fan_out(np.ones(self.weight.shape, np.int64)).sum())
+        return self.node.dense_operations
 
-    def _fan_out(self, present: Int) -> Int:
-        if present.ndim == 2:
-            reached_I: Int = present.sum(axis=0)
-            return reached_I
-        _, height, width = self.input_shape
-        kernel_Ikk = present.sum(axis=0)
-        _, kh, kw = kernel_Ikk.shape
-        (sy, sx), (py, px) = self.stride, self.padding
-        reached = np.zeros((len(kernel_Ikk), height + 2 * py, width + 2 * px), np.int64)
-        for y in range(0, height + 2 * py - kh + 1, sy):
-            for x in range(0, width + 2 * px - kw + 1, sx):
-                reached[:, y : y + kh, x : x + kw] += kernel_Ikk
-        return reached[:, py : py + height, px : px + width]
+
+@singledispatch
+def shares_weights(node: SynapseNode) -> bool:
+    """Whether a weight is used at several positions."""
+    raise no_rule("the counter", node, shares_weights.registry, _REMEDY)
+
+
+@shares_weights.register
+def _(node: Conv) -> bool:
+    return True
+
+
+@shares_weights.register
+def _(node: Dense) -> bool:
+    return False
+
+
+@singledispatch
+def _fan_out(node: SynapseNode, present: Int) -> Int:
+    """How many of the weights that are present each input meets; ``present`` is 0 or 1, of the weight's shape."""
+    raise no_rule("the counter", node, _fan_out.registry, _REMEDY)
+
+
+@_fan_out.register
+def _(node: Dense, present: Int) -> Int:
+    reached_I: Int = present.sum(axis=0)
+    return reached_I
+
+
+@_fan_out.register
+def _(node: Conv, present: Int) -> Int:
+    _, height, width = node.input_shape
+    kernel_Ikk = present.sum(axis=0)
+    _, kh, kw = kernel_Ikk.shape
+    (sy, sx), (py, px) = node.stride, node.padding
+    reached = np.zeros((len(kernel_Ikk), height + 2 * py, width + 2 * px), np.int64)
+    for y in range(0, height + 2 * py - kh + 1, sy):
+        for x in range(0, width + 2 * px - kw + 1, sx):
+            reached[:, y : y + kh, x : x + kw] += kernel_Ikk
+    return reached[:, py : py + height, px : px + width]
 
 
 class SynapseCounter:
@@ -79,7 +108,7 @@ class SynapseCounter:
         decisions: decisions seen.
     """
 
-    def __init__(self, synapses: Synapses) -> None:
+    def __init__(self, synapses: CountedSynapses) -> None:
         self.synapses = synapses
         self.fan_out = synapses.fan_out().reshape(-1)
         self.operations_T: Int = np.zeros(0, np.int64)

@@ -4,7 +4,7 @@ The graph takes the encoded input of one simulation step and ends at the head's 
 and applies the readout (mean: averages the outputs). NIR is continuous in time: ``dt`` is the length of one simulation
 step that makes the discrete network of :mod:`switchmt_snn.spiking.neurons` out of it by explicit Euler steps.
 
-Profiles:
+Dialects:
 
 - ``portable``: Input, Conv2d, IF or LIF, Flatten, Affine, Output; dt = 1 and r = 1; reset to zero. A LIF's input is
   scaled by tau / dt = 1 / (1 - beta) in the weights, because importers ignore or restrict r.
@@ -12,10 +12,14 @@ Profiles:
 - ``exact``: also reset by subtraction, as a loop: an integrator (I, or LI with its own r), a Threshold, and a Scale by
   minus the threshold back into the integrator, one step later.
 - ``legacy``: no ``v_reset`` in the file, so that nir <= 1.0.4 reads it; how a spike resets is in the metadata only.
+
+Each node of the network has one rule; a node without a rule is refused by name.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from functools import singledispatch
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -25,144 +29,189 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.folding import FoldedNetwork, Layer, Neurons, metadata
+from switchmt_snn.export.folded import metadata
+from switchmt_snn.spiking.folding import FoldedNetwork
+from switchmt_snn.spiking.layers import Array, Conv, Dense, Float, Layer, NeuronNode, SynapseNode, no_rule
+from switchmt_snn.spiking.neurons import LeakyNode
 
-NirProfile = Literal["portable", "spikingjelly", "exact", "legacy"]
+NirDialect = Literal["portable", "spikingjelly", "exact", "legacy"]
+DIALECT_KEY = "profile"
+"""Metadata key of a file's dialect; files of older versions have it, too."""
 _DT = {"portable": 1.0, "spikingjelly": 1e-4, "exact": 1.0, "legacy": 1.0}
+_REMEDY = "use --onnx"
 
-Float = npt.NDArray[np.float32]
+
+@dataclass
+class _Chain:
+    """A NIR graph while it grows; each appended node hears the one before it."""
+
+    last: str
+    nodes: dict[str, nir.NIRNode] = field(default_factory=dict)
+    edges: list[tuple[str, str]] = field(default_factory=list)
+
+    def append(self, name: str, node: nir.NIRNode) -> None:
+        self.nodes[name] = node
+        self.edges.append((self.last, name))
+        self.last = name
 
 
-def nir_graph(network: FoldedNetwork, task: int, profile: NirProfile = "portable") -> nir.NIRGraph:
+def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable") -> nir.NIRGraph:
     """The graph of one task.
 
     Raises:
-        ExportError: the network has no exact expression in the profile (ANN, k winners, reset by subtraction).
+        ExportError: the network has no exact expression in the dialect (ANN, k winners, reset by subtraction), or a
+            node without a rule.
     """
-    _check(network, profile)
-    nodes: dict[str, nir.NIRNode] = {"input": nir.Input({"input": np.array(network.encoded_shape)})}
-    edges: list[tuple[str, str]] = []
-    last = "input"
-
-    def append(name: str, node: nir.NIRNode) -> None:
-        nonlocal last
-        nodes[name] = node
-        edges.append((last, name))
-        last = name
-
+    if dialect not in _DT:
+        raise ExportError(f"the NIR dialect is {dialect!r}, expected one of {', '.join(_DT)}")
+    chain = _Chain("input", {"input": nir.Input({"input": np.array(network.encoded_shape)})})
     shape = network.encoded_shape
     for layer in network.layers:
-        if not layer.is_convolution and len(shape) > 1:
-            append("flatten", nir.Flatten({"input": np.array(shape)}, start_dim=0, end_dim=-1))
-        append(layer.name, _synapses(layer, task, profile))
+        gain_O = _input_gain_O(layer.neurons, dialect)
+        _synapses(layer.synapses, chain, shape, task, gain_O)
+        _neurons(layer.neurons, chain, layer, dialect)
         shape = layer.output_shape
-        if layer.neurons is not None:
-            append_neurons = _loop if _needs_loop(layer.neurons, profile) else _node
-            append_neurons(layer, nodes, edges, profile)
-            last = f"{layer.name}_neurons"
-    nodes["output"] = nir.Output({"output": np.array(shape)})
-    edges.append((last, "output"))
+    _synapses(network.head, chain, shape, task, np.ones(1, np.float32))
+    chain.append("output", nir.Output({"output": np.array(network.head.output_shape)}))
     facts = metadata(network) | {
-        "task": network.suite.names[task],
-        "dt": _DT[profile],
-        "profile": profile,
+        "task": network.tasks[task],
+        "dt": _DT[dialect],
+        DIALECT_KEY: dialect,
         "output": "head current of one step; readout over the T steps is the host's",
     }
-    return nir.NIRGraph(nodes, edges, metadata=_storable(facts))
+    return nir.NIRGraph(chain.nodes, chain.edges, metadata=_storable(facts))
 
 
-def can_express(network: FoldedNetwork, profile: NirProfile = "portable") -> bool:
+def can_express(network: FoldedNetwork, dialect: NirDialect = "portable") -> bool:
     """Whether :func:`nir_graph` has an exact graph for the network."""
     try:
-        _check(network, profile)
+        nir_graph(network, 0, dialect)
     except ExportError:
         return False
     return True
 
 
 def write_nir(graph: nir.NIRGraph, path: Path) -> None:
-    """Write a graph to a file; the ``legacy`` profile leaves the all-zero ``v_reset`` out."""
+    """Write a graph to a file; the ``legacy`` dialect leaves the all-zero ``v_reset`` out."""
     nir.write(path, graph)
-    if graph.metadata["profile"] == "legacy":
+    if dialect_of(graph) == "legacy":
         with h5py.File(path, "a") as file:
             for node in cast(Any, file["node/nodes"]).values():
                 if "v_reset" in node:
                     del node["v_reset"]
 
 
-def _check(network: FoldedNetwork, profile: str) -> None:
-    settings = network.config.network
-    if not network.spiking:
+def dialect_of(graph: nir.NIRGraph) -> NirDialect:
+    """The dialect that a graph of this package is written in."""
+    return cast(NirDialect, str(graph.metadata[DIALECT_KEY]))
+
+
+@singledispatch
+def _synapses(node: SynapseNode, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
+    """Append a layer's synapses, which see a signal of the given shape, with a factor on every output channel."""
+    raise no_rule("NIR", node, _synapses.registry, _REMEDY)
+
+
+@_synapses.register
+def _(node: Conv, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
+    weight, bias = _scaled(node, task, gain_O)
+    height, width = node.input_shape[1:]
+    stride, padding = _plain(node.stride), _plain(node.padding)
+    kernel = nir.Conv2d(
+        input_shape=(height, width), weight=weight, stride=stride, padding=padding, dilation=1, groups=1, bias=bias
+    )
+    chain.append(node.name, kernel)
+
+
+@_synapses.register
+def _(node: Dense, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
+    if node.k_winners is not None:
         raise ExportError(
-            f"{settings.method} has ReLU neurons, expected a spiking method; NIR has no ReLU node: use --onnx"
+            f"network.k_winners is {node.k_winners}, expected null; NIR cannot compare neurons: use --onnx"
         )
-    if settings.k_winners is not None:
-        raise ExportError(
-            f"network.k_winners is {settings.k_winners}, expected null; NIR cannot compare neurons: use --onnx"
-        )
-    if settings.reset == "subtract" and profile in ("portable", "spikingjelly"):
-        raise ExportError(
-            f"the network resets by subtraction, expected reset to zero for the NIR profile {profile!r} (that is what "
-            "importers of nir.IF do); use --nir-profile exact (any simulator with loops) or legacy (sinabs)"
-        )
+    if len(shape) > 1:
+        chain.append("flatten", nir.Flatten({"input": np.array(shape)}, start_dim=0, end_dim=-1))
+    weight, bias = _scaled(node, task, gain_O)
+    chain.append(node.name, nir.Affine(weight=weight, bias=bias))
 
 
-def _needs_loop(neurons: Neurons, profile: str) -> bool:
-    return profile == "exact" and neurons.reset == "subtract"
+def _scaled(node: SynapseNode, task: int, gain_O: Float) -> tuple[Float, Float]:
+    weight, bias = node.folded(task)
+    return weight * gain_O.reshape(-1, *(1,) * (weight.ndim - 1)), bias * gain_O
 
 
-def _input_gain_O(layer: Layer, profile: str) -> Float:
-    """Factor on the weights in front of a LIF node whose r is 1, per output channel."""
-    neurons = layer.neurons
-    if neurons is None or neurons.kind != "LIF" or _needs_loop(neurons, profile):
+def _plain(pair: tuple[int, int]) -> int | tuple[int, int]:
+    """One number where both are equal, which more importers take."""
+    return pair[0] if pair[0] == pair[1] else pair
+
+
+@singledispatch
+def _input_gain_O(neurons: NeuronNode, dialect: str) -> Float:
+    """Factor on the weights in front of the neurons, per output channel."""
+    raise no_rule("NIR", neurons, _input_gain_O.registry, _REMEDY)
+
+
+@_input_gain_O.register
+def _(neurons: LeakyNode, dialect: str) -> Float:
+    if not _decays(neurons) or _needs_loop(neurons, dialect):
         return np.ones(1, np.float32)
     return (1.0 / (1.0 - _leak(neurons))).astype(np.float32)
 
 
-def _leak(neurons: Neurons) -> npt.NDArray[np.float64]:
+@singledispatch
+def _neurons(neurons: NeuronNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+    """Append a layer's neurons; the node that spikes is called ``<layer>_neurons``."""
+    raise no_rule("NIR", neurons, _neurons.registry, _REMEDY)
+
+
+@_neurons.register
+def _(neurons: LeakyNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+    if neurons.reset == "subtract" and dialect in ("portable", "spikingjelly"):
+        raise ExportError(
+            f"the network resets by subtraction, expected reset to zero for the NIR dialect {dialect!r} (that is what "
+            "importers of nir.IF do); use --nir-profile exact (any simulator with loops) or legacy (sinabs)"
+        )
+    if _needs_loop(neurons, dialect):
+        _append_loop(neurons, chain, layer, _DT[dialect])
+    else:
+        chain.append(f"{layer.name}_neurons", _leaky(neurons, layer, _DT[dialect]))
+
+
+def _decays(neurons: LeakyNode) -> bool:
+    return bool((neurons.beta_O != 1.0).any())
+
+
+def _needs_loop(neurons: LeakyNode, dialect: str) -> bool:
+    return dialect == "exact" and neurons.reset == "subtract"
+
+
+def _leak(neurons: LeakyNode) -> Array:
     if (neurons.beta_O >= 1.0).any():
         raise ExportError("a LIF neuron has beta 1 and thus no time constant, expected beta < 1 or network.neuron IF")
     return neurons.beta_O
 
 
-def _synapses(layer: Layer, task: int, profile: str) -> nir.NIRNode:
-    weight, bias = layer.folded(task)
-    gain_O = _input_gain_O(layer, profile)
-    weight, bias = weight * gain_O.reshape(-1, *(1,) * (weight.ndim - 1)), bias * gain_O
-    if not layer.is_convolution:
-        return nir.Affine(weight=weight, bias=bias)
-    height, width = layer.input_shape[1:]
-    stride = cast(int, layer.stride)
-    return nir.Conv2d(
-        input_shape=(height, width), weight=weight, stride=stride, padding=0, dilation=1, groups=1, bias=bias
-    )
-
-
-def _node(layer: Layer, nodes: dict[str, nir.NIRNode], edges: list[tuple[str, str]], profile: str) -> None:
+def _leaky(neurons: LeakyNode, layer: Layer, dt: float) -> nir.NIRNode:
     """IF or LIF with parameters of the layer's full shape (importers do not broadcast)."""
-    neurons, dt = cast(Neurons, layer.neurons), _DT[profile]
-    name = f"{layer.name}_neurons"
     threshold, zero = _full(layer, neurons.threshold_O), _full(layer, 0.0)
-    if neurons.kind == "IF":
-        nodes[name] = nir.IF(r=_full(layer, 1.0 / dt), v_threshold=threshold, v_reset=zero)
-    else:
-        tau = _full(layer, dt / (1.0 - _leak(neurons)))
-        nodes[name] = nir.LIF(tau=tau, r=_full(layer, 1.0), v_leak=zero, v_threshold=threshold, v_reset=zero.copy())
-    edges.append((layer.name, name))
+    if not _decays(neurons):
+        return nir.IF(r=_full(layer, 1.0 / dt), v_threshold=threshold, v_reset=zero)
+    tau = _full(layer, dt / (1.0 - _leak(neurons)))
+    return nir.LIF(tau=tau, r=_full(layer, 1.0), v_leak=zero, v_threshold=threshold, v_reset=zero.copy())
 
 
-def _loop(layer: Layer, nodes: dict[str, nir.NIRNode], edges: list[tuple[str, str]], profile: str) -> None:
+def _append_loop(neurons: LeakyNode, chain: _Chain, layer: Layer, dt: float) -> None:
     """``U(t) = beta U(t-1) + I(t) - threshold S(t-1)``; the Threshold carries the layer's neuron name."""
-    neurons, dt = cast(Neurons, layer.neurons), _DT[profile]
-    membrane, name, reset = f"{layer.name}_membrane", f"{layer.name}_neurons", f"{layer.name}_reset"
-    if neurons.kind == "IF":
-        nodes[membrane] = nir.I(r=_full(layer, 1.0 / dt))
-    else:
+    membrane, reset = f"{layer.name}_membrane", f"{layer.name}_reset"
+    if _decays(neurons):
         tau = dt / (1.0 - _leak(neurons))
-        nodes[membrane] = nir.LI(tau=_full(layer, tau), r=_full(layer, tau / dt), v_leak=_full(layer, 0.0))
-    nodes[name] = nir.Threshold(threshold=_full(layer, neurons.threshold_O))
-    nodes[reset] = nir.Scale(scale=_full(layer, -neurons.threshold_O))
-    edges += [(layer.name, membrane), (membrane, name), (name, reset), (reset, membrane)]
+        node = nir.LI(tau=_full(layer, tau), r=_full(layer, tau / dt), v_leak=_full(layer, 0.0))
+    else:
+        node = nir.I(r=_full(layer, 1.0 / dt))
+    chain.append(membrane, node)
+    chain.append(f"{layer.name}_neurons", nir.Threshold(threshold=_full(layer, neurons.threshold_O)))
+    chain.nodes[reset] = nir.Scale(scale=_full(layer, -neurons.threshold_O))
+    chain.edges += [(chain.last, reset), (reset, membrane)]
 
 
 def _full(layer: Layer, value_O: npt.ArrayLike) -> Float:

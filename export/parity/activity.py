@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from switchmt_snn.acting.agent import Agent
+from switchmt_snn.export.runtimes.agents import existing_only
 
 CHUNK = 32
 """Decisions that are held in memory at once."""
@@ -36,7 +37,7 @@ def active_neurons(agent: Agent, observations: npt.NDArray[Any], task: int, seed
     with torch.inference_mode():
         generator = torch.Generator().manual_seed(seed)
         q_BA = agent.network(torch.from_numpy(observations), task, activity=activity, generator=generator)
-    q = np.where(agent.suite.valid_actions_KA[task], q_BA.numpy(), np.float32(-np.inf))
+    q = existing_only(q_BA.numpy(), agent.suite.valid_actions_KA[task])
     parts: dict[str, list[npt.NDArray[np.bool_]]] = {}
     for name, values in activity.items():
         layer = name if name in agent.network.trunk else "hidden"

@@ -18,11 +18,12 @@ import numpy.typing as npt
 import onnxruntime
 
 from switchmt_snn.acting.agent import Agent
-from switchmt_snn.export.folding import FoldedNetwork
+from switchmt_snn.export.formats.onnx_nodes import states_of
 from switchmt_snn.export.parity.activity import active_neurons, chunks
-from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session, read_out
+from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, existing_only, onnx_session
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.spiking.folding import FoldedNetwork
 
 MIN_EQUAL_ACTIONS = 0.99
 """On real weights, an export that agrees on fewer actions fails."""
@@ -128,11 +129,9 @@ def trace_torch(agent: Agent, observations: npt.NDArray[Any], task: int, seed: i
 def trace_nir(network: FoldedNetwork, graph: nir.NIRGraph, encoded_TB: Float, task: int) -> Trace:
     """A NIR graph in the reference interpreter."""
     interpreter = NirInterpreter(graph, reset=str(graph.metadata["reset"]))
-    names = {layer.name: f"{layer.name}_neurons" for layer in network.hidden_layers}
+    names = {layer.name: f"{layer.name}_neurons" for layer in network.layers}
     outputs, recorded = interpreter.run(encoded_TB, list(names.values()))
-    settings = network.config.network
-    q = read_out(outputs, settings.readout, settings.readout_beta)
-    q = np.where(network.suite.valid_actions_KA[task], q, np.float32(-np.inf))
+    q = existing_only(network.readout(outputs), network.valid_actions_KA[task])
     return Trace(q, {name: _flat(recorded[node]) > 0 for name, node in names.items()})
 
 
@@ -148,19 +147,22 @@ def trace_onnx(
     batch = len(observations)
     tasks_B = np.full(batch, task)
     decided = decision.decide(observations, tasks_B, encoded_TB)
-    layers = network.hidden_layers
+    layers = network.layers
     counts_BL = decided.get("spike_counts")
     counts = {} if counts_BL is None else {layer.name: counts_BL[:, index] for index, layer in enumerate(layers)}
     if step is None:
         return Trace(decided["q_values"], {}, counts)
-    membranes = {f"membrane_{x.name}": np.zeros((batch, *x.output_shape), np.float32) for x in layers}
+    shapes = {
+        f"{state}_{layer.name}": (batch, *layer.output_shape) for layer in layers for state in states_of(layer.neurons)
+    }
+    states = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     spikes: dict[str, list[npt.NDArray[np.bool_]]] = {layer.name: [] for layer in layers}
     names = [value.name for value in step.get_outputs()]
     takes_task = any(value.name == "task" for value in step.get_inputs())
     for encoded_B in encoded_TB:
-        fed = {"encoded": np.ascontiguousarray(encoded_B), **membranes, **({"task": tasks_B} if takes_task else {})}
+        fed = {"encoded": np.ascontiguousarray(encoded_B), **states, **({"task": tasks_B} if takes_task else {})}
         out = dict(zip(names, step.run(names, fed), strict=True))
-        membranes = {name: out[f"{name}_next"] for name in membranes}
+        states = {name: out[f"{name}_next"] for name in states}
         for name, values in spikes.items():
             values.append(out[f"spikes_{name}"].reshape(batch, -1) > 0)
     return Trace(decided["q_values"], {name: np.stack(values) for name, values in spikes.items()}, counts)

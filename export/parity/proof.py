@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.acting.agent import Agent
-from switchmt_snn.export.folding import FoldedNetwork, fold
-from switchmt_snn.export.formats.nir_writer import NirProfile, nir_graph
+from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.export.formats.nir_writer import dialect_of, nir_graph
 from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import MIN_EQUAL_ACTIONS, Comparison, Exports, compare
 from switchmt_snn.export.parity.dyadic import dyadic_observations, exact_copy
@@ -21,6 +21,7 @@ from switchmt_snn.export.runtimes.agents import OnnxAgent, encode
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
 from switchmt_snn.export.runtimes.simulators import SIMULATORS, quietly, simulate
 from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.spiking.folding import FoldedNetwork
 
 DYADIC_DECISIONS = 32
 SIMULATOR_DECISIONS = 16
@@ -67,7 +68,7 @@ class _Proof:
         twin, exact = exact_copy(self.agent, exact_inputs)
         if not exact:
             self.failures.append("every dyadic copy rounds, so the bitwise check proves nothing (please report this)")
-        copied = self._same_kinds(fold(twin))
+        copied = self._same_kinds(fold_agent(twin))
         for task, name in enumerate(names):
             for comparison in compare(twin, copied, task, exact_inputs[task]):
                 dyadic.append(comparison.to_dict() | {"exact_arithmetic": exact})
@@ -95,11 +96,11 @@ class _Proof:
 
     def _same_kinds(self, network: FoldedNetwork) -> Exports:
         """Another network in the formats that were written."""
-        written, names = self.written, network.suite.names
+        written, names = self.written, network.tasks
         graphs = None
         if written.graphs is not None:
-            profile: NirProfile = str(next(iter(written.graphs.values())).metadata["profile"])  # type: ignore[assignment]
-            graphs = {name: nir_graph(network, k, profile) for k, name in enumerate(names)}
+            dialect = dialect_of(next(iter(written.graphs.values())))
+            graphs = {name: nir_graph(network, k, dialect) for k, name in enumerate(names)}
         return Exports(
             network,
             decision_model(network).SerializeToString() if written.decision is not None else None,
@@ -110,8 +111,7 @@ class _Proof:
 
     def _stored_integers(self, decision: bytes, task: int, recorded: Observations) -> dict[str, Any]:
         """The int8 file against a float32 graph with the same rounded weights: only the storage may differ."""
-        network = self.written.network
-        floats = replace(network, layers=tuple(replace(layer, weight_steps_O=None) for layer in network.layers))
+        floats = self.written.network.with_synapses(lambda node: replace(node, weight_steps_O=None))
         stored, plain = (
             OnnxAgent(model, self.agent.suite, self.agent.config).q_values(recorded, task)
             for model in (decision, decision_model(floats).SerializeToString())
@@ -127,7 +127,7 @@ class _Proof:
     ) -> list[dict[str, Any]]:
         """Every installed simulator on the dyadic graphs, against the interpreter under the same convention."""
         metadata = next(iter(graphs.values())).metadata
-        if str(metadata["profile"]) in ("exact", "legacy") or twin.config.network.neuron != "IF":
+        if dialect_of(next(iter(graphs.values()))) in ("exact", "legacy") or twin.config.network.neuron != "IF":
             return []  # loops, and files for older readers, are not what these importers take
         names = [
             name

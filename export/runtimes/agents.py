@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import nir
 import numpy as np
@@ -22,6 +22,7 @@ from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.spiking.encodings import Encoder
+from switchmt_snn.spiking.layers import Readout
 from switchmt_snn.tasks.suite import TaskSuite
 
 Observations = npt.NDArray[Any]
@@ -77,14 +78,9 @@ def encode(suite: TaskSuite, config: ExperimentConfig, observations: Observation
     return np.broadcast_to(encoded, (config.network.timesteps, *encoded.shape[1:]))
 
 
-def read_out(outputs_TBA: Float, readout: str, beta: float) -> Float:
-    """Q ``[B, A]`` from the head's outputs over time: their mean, or the last or largest value of an integrator."""
-    if readout == "mean":
-        return cast(Float, outputs_TBA.mean(axis=0))
-    membranes = [outputs_TBA[0]]
-    for output in outputs_TBA[1:]:
-        membranes.append(np.float32(beta) * membranes[-1] + output)
-    return cast(Float, membranes[-1] if readout == "last_membrane" else np.max(membranes, axis=0))
+def existing_only(q_BA: Float, valid_A: npt.NDArray[np.bool_]) -> Float:
+    """Q ``[B, A]`` with -inf where an action does not exist."""
+    return np.where(valid_A, q_BA, np.float32(-np.inf))
 
 
 class OnnxAgent:
@@ -170,8 +166,8 @@ class NirAgent:
         encoded = encode(self.suite, self.config, observation, self._generator)
         outputs, _ = self.interpreters[self.suite.names[index]].run(encoded)
         settings = self.config.network
-        q_BA = read_out(outputs, settings.readout, settings.readout_beta)
-        return np.where(self.suite.valid_actions_KA[index], q_BA, np.float32(-np.inf))
+        q_BA = Readout(settings.readout, settings.readout_beta)(outputs)
+        return existing_only(q_BA, self.suite.valid_actions_KA[index])
 
 
 class ComparedAgent:

@@ -282,7 +282,7 @@ def _export(argv: list[str]) -> int:
         nir=options.nir,
         tasks=options.task,
         int8=options.int8,
-        nir_profile=options.nir_profile,
+        nir_dialect=options.nir_profile,
         parity_decisions=options.parity_decisions,
     )
     console = Console(stderr=options.json)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
-import torch
-from torch import nn
-
 from switchmt_snn.config import METHOD_TRAITS, METHODS, ExperimentConfig, resolve
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.runs.memory import MemoryEstimate, estimate_memory
-from switchmt_snn.spiking.network import QNetwork, Stream, TrunkLayer, build_network, trainable_parameters
+from switchmt_snn.spiking.folding import network_nodes
+from switchmt_snn.spiking.layers import SynapseNode
+from switchmt_snn.spiking.network import QNetwork, Stream, build_network, trainable_parameters
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -94,52 +93,32 @@ def describe_method(config: ExperimentConfig, suite: TaskSuite) -> MethodDescrip
 
 
 def _layers(network: QNetwork) -> list[LayerDescription]:
-    """Shapes by one forward pass on a blank observation."""
-    config = network.config
-    activity: dict[str, torch.Tensor] = {}
-    network.eval()
-    with torch.inference_mode():
-        network(torch.zeros(1, *network.observation.shape), 0, activity=activity)
-    channels = network.encoder.input_channels(network.observation.shape[0])
-    shape: tuple[int, ...] = (channels, *network.observation.shape[1:])
-    steps = 1 if config.encoding == "direct" else config.timesteps
+    """The network's nodes, each stream's hidden layer and head apart."""
+    steps, nodes = network.config.timesteps, network_nodes(network)
+    first_steps = 1 if network.config.encoding == "direct" else steps
+    head_steps = 1 if network.config.readout == "mean" else steps
     layers = []
-    for name, module in network.trunk.items():
-        layer = cast(TrunkLayer, module)
-        output = tuple(activity[name].shape[2:])
-        layers.append(_layer(name, layer, layer.synapses, shape, output, steps, neurons=True))
-        shape, steps = output, config.timesteps
-    features: tuple[int, ...] = (int(torch.tensor(shape).prod()),)
-    for name, module in network.streams.items():
-        stream = cast(Stream, module)
-        hidden, head = stream.synapses, stream.head
-        parameters = trainable_parameters(stream) - trainable_parameters(head)
-        first = _layer(f"{name}.hidden", stream, hidden, features, (hidden.out_features,), steps, neurons=True)
-        layers.append(replace(first, parameters=parameters))
-        head_steps = 1 if config.readout == "mean" else config.timesteps
-        out = (head.out_features,)
-        layers.append(_layer(f"{name}.head", head, head, (hidden.out_features,), out, head_steps, neurons=False))
+    for layer in nodes.trunk:
+        owned = trainable_parameters(network.trunk[layer.name])
+        layers.append(_described(layer.synapses, owned, first_steps, neurons=True))
+        first_steps = steps
+    for name, stream in nodes.streams.items():
+        module = cast(Stream, network.streams[name])
+        head = trainable_parameters(module.head)
+        owned = trainable_parameters(module) - head
+        layers.append(_described(stream.hidden.synapses, owned, first_steps, neurons=True))
+        layers.append(_described(stream.head, head, head_steps, neurons=False))
     return layers
 
 
-def _layer(
-    name: str,
-    owner: nn.Module,
-    synapses: nn.Module,
-    input_shape: tuple[int, ...],
-    output_shape: tuple[int, ...],
-    steps: int,
-    neurons: bool,
-) -> LayerDescription:
-    outputs = int(torch.tensor(output_shape).prod())
-    weight = next(parameter for parameter in synapses.parameters() if parameter.dim() > 1)
+def _described(node: SynapseNode, parameters: int, steps: int, neurons: bool) -> LayerDescription:
     return LayerDescription(
-        name=name,
-        kind="Conv2d" if weight.dim() == 4 else "Linear",
-        input_shape=input_shape,
-        output_shape=output_shape,
-        parameters=trainable_parameters(owner),
-        neurons=outputs if neurons else 0,
-        operations_per_step=outputs * weight[0].numel(),
+        name=node.name,
+        kind=node.kind,
+        input_shape=node.input_shape,
+        output_shape=node.output_shape,
+        parameters=parameters,
+        neurons=node.outputs if neurons else 0,
+        operations_per_step=node.dense_operations,
         steps=steps,
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.shapes import LayerShape
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from tests.export.export_cases import make_agent
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "chip_fits.json"
@@ -61,7 +61,7 @@ def golden_networks() -> dict[str, list[LayerShape]]:
         "small": chain(16, 60, 40, 8),
         "too large for any core": chain(30_000, 9_000, 9_000),
         "odd strides and sides": [conv("conv1", (2, 60, 80), 8, 5, 3), linear("hidden", (8, 4, 7), 5)],
-        **{name: list(layer_shapes(fold(make_agent(**settings)))) for name, settings in real.items()},  # type: ignore[arg-type]
+        **{name: list(layer_shapes(fold_agent(make_agent(**settings)))) for name, settings in real.items()},  # type: ignore[arg-type]
     }
 
 

@@ -11,12 +11,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from switchmt_snn.export.counts.synapses import NeuronCounter, SynapseCounter, Synapses
+from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
+from switchmt_snn.spiking.layers import Conv, Dense, convolved_sides
+
+
+def synapses_of(
+    weight: np.ndarray,
+    input_shape: tuple[int, ...],
+    spiking_input: bool,
+    stride: tuple[int, int] = (1, 1),
+    padding: tuple[int, int] = (0, 0),
+) -> CountedSynapses:
+    """Synapses without a bias, for one task; a convolution if the weight is a kernel."""
+    zeros = np.zeros((1, len(weight)))
+    facts = {"name": "x", "weight": weight, "scale_KO": zeros + 1, "shift_KO": zeros, "input_shape": input_shape}
+    if weight.ndim == 2:
+        return CountedSynapses(Dense(**facts, output_shape=(len(weight),)), spiking_input)
+    output_shape = (len(weight), *convolved_sides(input_shape[1:], weight.shape[2:], stride, padding))
+    return CountedSynapses(Conv(**facts, output_shape=output_shape, stride=stride, padding=padding), spiking_input)
 
 
 def test_three_neurons_on_paper() -> None:
     """Inputs 1, 2, 3; weights [[1, 0, 2], [0, 0, 5]]: input 1 reaches one neuron, input 2 none, input 3 both."""
-    synapses = Synapses("fc", np.array([[1.0, 0, 2], [0, 0, 5]]), (3,), spiking_input=True)
+    synapses = synapses_of(np.array([[1.0, 0, 2], [0, 0, 5]]), (3,), spiking_input=True)
     assert synapses.fan_out().tolist() == [1, 0, 2]
     assert synapses.dense_operations() == 6
     counter = SynapseCounter(synapses)
@@ -30,12 +47,12 @@ def test_three_neurons_on_paper() -> None:
 
 def test_an_image_of_three_by_three_on_paper() -> None:
     """One 2x2 kernel over 3x3: corners are reached once, edges twice, the middle four times; 16 in all."""
-    synapses = Synapses("conv", np.ones((1, 1, 2, 2)), (1, 3, 3), spiking_input=False)
+    synapses = synapses_of(np.ones((1, 1, 2, 2)), (1, 3, 3), spiking_input=False)
     assert synapses.fan_out()[0].tolist() == [[1, 2, 1], [2, 4, 2], [1, 2, 1]]
     assert synapses.dense_operations() == 16
-    padded = Synapses("conv", np.ones((1, 1, 3, 3)), (1, 3, 3), spiking_input=False, padding=(1, 1))
+    padded = synapses_of(np.ones((1, 1, 3, 3)), (1, 3, 3), spiking_input=False, padding=(1, 1))
     assert padded.fan_out()[0].tolist() == [[4, 6, 4], [6, 9, 6], [4, 6, 4]], "padding itself is not counted"
-    strided = Synapses("conv", np.ones((2, 1, 2, 2)), (1, 4, 4), spiking_input=False, stride=(2, 2))
+    strided = synapses_of(np.ones((2, 1, 2, 2)), (1, 4, 4), spiking_input=False, stride=(2, 2))
     assert (strided.fan_out() == 2).all()
     assert synapses.operation == "MAC"
 
@@ -62,7 +79,9 @@ LAYERS = {
 }
 
 
-def random_layer(linear, channels, out, side, kernel, stride, padding, pruned, seed) -> tuple[nn.Module, Synapses]:
+def random_layer(
+    linear, channels, out, side, kernel, stride, padding, pruned, seed
+) -> tuple[nn.Module, CountedSynapses]:
     torch.manual_seed(seed)
     layer: nn.Linear | nn.Conv2d
     if linear:
@@ -72,10 +91,10 @@ def random_layer(linear, channels, out, side, kernel, stride, padding, pruned, s
     with torch.no_grad():
         layer.weight *= torch.rand_like(layer.weight) >= pruned
     weight = layer.weight.detach().numpy()
-    return layer, Synapses("x", weight, shape, True, stride=(stride, stride), padding=(padding, padding))
+    return layer, synapses_of(weight, shape, True, stride=(stride, stride), padding=(padding, padding))
 
 
-def counted(synapses: Synapses, spikes: torch.Tensor) -> int:
+def counted(synapses: CountedSynapses, spikes: torch.Tensor) -> int:
     counter = SynapseCounter(synapses)
     counter.add(spikes.numpy()[None] != 0)
     return int(counter.operations_T.sum())
@@ -88,13 +107,13 @@ def test_counts_equal_a_pass_with_ones(
 ) -> None:
     """Every weight and input replaced by whether it is there: the layer's own output is the count."""
     layer, synapses = random_layer(linear, channels, out, side, kernel, stride, padding, pruned, seed)
-    spikes = (torch.rand(3, *synapses.input_shape) < density).float()
+    spikes = (torch.rand(3, *synapses.node.input_shape) < density).float()
     with torch.no_grad():
         layer.weight.copy_((layer.weight != 0).float())
         layer.bias.zero_()
         assert counted(synapses, spikes) == int(layer.double()(spikes.double()).sum())
         layer.weight.fill_(1.0)
-        ones = torch.ones(1, *synapses.input_shape, dtype=torch.float64)
+        ones = torch.ones(1, *synapses.node.input_shape, dtype=torch.float64)
         assert synapses.dense_operations() == int(layer(ones).sum())
 
 
@@ -106,7 +125,7 @@ def test_counts_equal_neurobench(linear, channels, out, side, kernel, stride, pa
     from neurobench.metrics.utils.layers import single_layer_MACs
 
     layer, synapses = random_layer(linear, channels, out, side, kernel, stride, padding, pruned, seed)
-    spikes = (torch.rand(3, *synapses.input_shape) < density).float()
+    spikes = (torch.rand(3, *synapses.node.input_shape) < density).float()
     operations, _ = single_layer_MACs(spikes, layer)
     assert counted(synapses, spikes) == operations
     dense, _ = single_layer_MACs(spikes, layer, total=True)
@@ -121,7 +140,7 @@ def test_counts_equal_spikingjelly(linear, channels, out, side, kernel, stride, 
     from spikingjelly.activation_based.op_counter import DispatchCounterMode, SynOpCounter
 
     layer, synapses = random_layer(linear, channels, out, side, kernel, stride, padding, 0.0, seed)
-    spikes = (torch.rand(3, *synapses.input_shape) < density).float()
+    spikes = (torch.rand(3, *synapses.node.input_shape) < density).float()
     counter = SynOpCounter()
     with torch.no_grad(), DispatchCounterMode([counter]):
         layer(spikes)

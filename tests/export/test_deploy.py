@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
 from switchmt_snn.export.formats.onnx_writer import decision_model
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations
@@ -32,7 +32,7 @@ def programs() -> dict[str, str]:
 
 def test_a_host_without_torch_and_without_this_package_plays_pong(tmp_path: Path) -> None:
     agent = make_agent(tasks={"suite": "atari", "names": ["breakout", "pong"]}, trunk="nature")
-    write_atomically(tmp_path / "decision.onnx", decision_model(fold(agent)).SerializeToString())
+    write_atomically(tmp_path / "decision.onnx", decision_model(fold_agent(agent)).SerializeToString())
     program = programs()["play.py"]
     assert len(program.splitlines()) <= 30
     (tmp_path / "play.py").write_text(program)
@@ -72,7 +72,7 @@ def test_programs_for_other_simulators(name: str, tmp_path: Path) -> None:
     if not simulator.installed:
         pytest.skip(f"{name} is not installed")
     agent = dyadic_copy(make_agent(seed=2))
-    graph = nir_graph(fold(agent), 1)
+    graph = nir_graph(fold_agent(agent), 1)
     write_nir(graph, tmp_path / "asterix.nir")
     x = dyadic_observations(observations(agent, 1, seed=3))
     np.save(tmp_path / "observation.npy", x[0])

@@ -17,19 +17,20 @@ from hypothesis import strategies as st
 
 from switchmt_snn.config import METHOD_TRAITS, METHODS
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.folding import FoldedNetwork, fold, quantized
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.nir_writer import can_express, nir_graph, write_nir
 from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports, compare, trace_torch
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations, exact_copy
-from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session, read_nir, read_out
+from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session, read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
+from switchmt_snn.spiking.folding import FoldedNetwork, quantized
 from switchmt_snn.spiking.neurons import LeakyLayer
 from tests.export.export_cases import VARIANTS, make_agent, observations
 
 
 def exports(agent, profile: str | None) -> Exports:
-    network = fold(agent)
+    network = fold_agent(agent)
     graphs = None
     if profile is not None:
         graphs = {name: nir_graph(network, k, profile) for k, name in enumerate(agent.suite.names)}
@@ -115,7 +116,7 @@ def test_real_weights_decide_alike(variant: str) -> None:
 def test_a_batch_may_mix_tasks_and_one_file_per_task_says_the_same() -> None:
     agent = make_agent()
     x, tasks = observations(agent, 30), np.arange(30) % 3
-    network = fold(agent)
+    network = fold_agent(agent)
     mixed = OnnxAgent(decision_model(network).SerializeToString(), agent.suite, agent.config)
     q = mixed.decide(x, tasks)["q_values"]
     for task in range(3):
@@ -127,9 +128,8 @@ def test_a_batch_may_mix_tasks_and_one_file_per_task_says_the_same() -> None:
 
 def with_wrong_layer(network: FoldedNetwork, index: int) -> FoldedNetwork:
     """The network with all currents of one layer raised."""
-    layers = list(network.layers)
-    layers[index] = replace(layers[index], shift_KO=layers[index].shift_KO + 1.0)
-    return replace(network, layers=tuple(layers))
+    wrong = network.synapses[index]
+    return network.with_synapses(lambda node: replace(node, shift_KO=node.shift_KO + 1.0) if node is wrong else node)
 
 
 def test_a_broken_export_is_caught_and_the_layer_named() -> None:
@@ -137,7 +137,7 @@ def test_a_broken_export_is_caught_and_the_layer_named() -> None:
     agent = dyadic_copy(make_agent())
     x = observations(agent, 24)
     for index, name in enumerate(["conv1", "hidden", "head"]):
-        wrong = with_wrong_layer(fold(agent), index)
+        wrong = with_wrong_layer(fold_agent(agent), index)
         model, own = (decision_model(wrong, task).SerializeToString() for task in (None, 1))
         graphs = {"asterix": nir_graph(wrong, 1)}
         written = Exports(wrong, model, step_model(wrong).SerializeToString(), graphs, {"asterix": own})
@@ -152,16 +152,16 @@ def test_a_broken_export_is_caught_and_the_layer_named() -> None:
 @pytest.mark.parametrize("task", [None, 2])
 def test_int8_weights_are_stored_as_integers_and_mean_the_rounded_ones(variant: str, task: int | None) -> None:
     agent = make_agent(**VARIANTS[variant])
-    network = quantized(fold(agent))
+    network = quantized(fold_agent(agent))
     model = decision_model(network, task)
     stored = {t.name: onnx.numpy_helper.to_array(t) for t in model.graph.initializer}
-    for layer, original in zip(network.layers, fold(agent).layers, strict=True):
-        integers = stored[f"{layer.name}_weight_int8"]
+    for node, original in zip(network.synapses, fold_agent(agent).synapses, strict=True):
+        integers = stored[f"{node.name}_weight_int8"]
         assert integers.dtype == np.int8
         assert np.abs(integers).max() == 127
-        shape = (-1, *(1,) * (layer.weight.ndim - 1))
-        assert (np.abs(layer.weight - original.weight) <= layer.weight_steps_O.reshape(shape) * 0.5 + 1e-12).all()
-    floats = replace(network, layers=tuple(replace(layer, weight_steps_O=None) for layer in network.layers))
+        half_a_step = node.over_weight(node.weight_steps_O) * 0.5 + 1e-12
+        assert (np.abs(node.weight - original.weight) <= half_a_step).all()
+    floats = network.with_synapses(lambda node: replace(node, weight_steps_O=None))
     x = observations(agent, 100)
     values = [
         OnnxAgent(m.SerializeToString(), agent.suite, agent.config).q_values(x, 2)
@@ -173,7 +173,7 @@ def test_int8_weights_are_stored_as_integers_and_mean_the_rounded_ones(variant: 
 
 def test_files_say_what_a_host_must_know() -> None:
     agent = make_agent(threshold=0.75, timesteps=3)
-    model = decision_model(fold(agent))
+    model = decision_model(fold_agent(agent))
     facts = {entry.key: entry.value for entry in model.metadata_props}
     assert json.loads(facts["tasks"]) == ["breakout", "asterix", "space_invaders"]
     assert (facts["method"], facts["encoding"], facts["reset"]) == ("SwitchMT", "direct", "zero")
@@ -189,7 +189,7 @@ def test_files_say_what_a_host_must_know() -> None:
 @pytest.mark.parametrize("variant", ["SwitchMT", "LIF", "mlp"])
 def test_nir_files_survive_the_disk(profile: str, variant: str, tmp_path: Path) -> None:
     agent = dyadic_copy(make_agent(**VARIANTS[variant]))
-    network = fold(agent)
+    network = fold_agent(agent)
     graph = nir_graph(network, 1, profile)
     write_nir(graph, tmp_path / "task.nir")
     again = read_nir(tmp_path / "task.nir")
@@ -205,8 +205,7 @@ def test_nir_files_survive_the_disk(profile: str, variant: str, tmp_path: Path) 
     x = dyadic_observations(observations(agent, 8))
     encoded = encode(agent.suite, agent.config, x, 0)
     assert np.array_equal(NirInterpreter(graph).run(encoded)[0], NirInterpreter(again).run(encoded)[0])
-    settings = agent.config.network
-    q = read_out(NirInterpreter(again).run(encoded)[0], settings.readout, settings.readout_beta)
+    q = network.readout(NirInterpreter(again).run(encoded)[0])
     np.testing.assert_allclose(q, trace_torch(agent, x, 1, 0).q_BA, rtol=1e-6, atol=1e-6)
     import h5py
 
@@ -230,7 +229,7 @@ def test_legacy_with_subtract_needs_the_rule_from_the_metadata() -> None:
 
 def test_what_nir_cannot_say_is_refused() -> None:
     for variant, message in (("DQN", "ReLU"), ("k winners", "k_winners"), ("subtract", "--nir-profile exact")):
-        network = fold(make_agent(**VARIANTS[variant]))
+        network = fold_agent(make_agent(**VARIANTS[variant]))
         assert not can_express(network)
         with pytest.raises(ExportError, match=message):
             nir_graph(network, 0)
@@ -241,19 +240,19 @@ def test_weights_that_are_not_finite_are_refused() -> None:
     with torch.no_grad():
         agent.network.trunk["conv1"].synapses.weight[0, 0, 0, 0] = torch.nan
     with pytest.raises(ExportError, match=r"trunk\.conv1\.synapses\.weight holds values that are not finite"):
-        fold(agent)
+        fold_agent(agent)
 
 
 def test_damaged_and_foreign_files_are_named(tmp_path: Path) -> None:
     agent = make_agent()
     path = tmp_path / "decision.onnx"
-    onnx.save(decision_model(fold(agent)), path)
+    onnx.save(decision_model(fold_agent(agent)), path)
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ExportError, match="cannot be read"):
         onnx_session(path)
     with pytest.raises(ExportError, match="cannot be read"):
         read_nir(path)
-    model = decision_model(fold(agent))
+    model = decision_model(fold_agent(agent))
     onnx.save(model, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
     with pytest.raises(ExportError, match="keeps weights in other files"):
         onnx_session(path)

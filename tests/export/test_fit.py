@@ -23,7 +23,7 @@ from switchmt_snn.export.chips.chip_file import builtin_chips
 from switchmt_snn.export.chips.fit import ChipFit, check_fit, layer_shapes
 from switchmt_snn.export.chips.mappings import CorePerLayer, assign_cores, convolution_memory_ki
 from switchmt_snn.export.chips.shapes import LayerShape
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from tests.export.chip_networks import ATARI, BUILT_IN, CONVOLUTIONS, GOLDEN, chain, conv, golden_fits, linear
 from tests.export.export_cases import make_agent
 
@@ -211,7 +211,7 @@ def test_a_stated_change_of_a_layer_is_true(layer: LayerShape, chip: str) -> Non
 @pytest.mark.parametrize("trunk", ["auto", "mlp"])
 def test_a_stated_number_of_hidden_units_is_true(trunk: str) -> None:
     def fit(hidden_units: int) -> ChipFit:
-        return check_fit(layer_shapes(fold(make_agent(hidden_units=hidden_units, trunk=trunk))), "speck")
+        return check_fit(layer_shapes(fold_agent(make_agent(hidden_units=hidden_units, trunk=trunk))), "speck")
 
     most = stated(fit(300).change)
     assert fit(most).fits
@@ -231,12 +231,12 @@ def test_hidden_units_change_what_comes_after_them_but_not_the_head() -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"trunk": "mlp"}, {"method": "DSQN"}, {"method": "DQN"}], ids=str)
 def test_shapes_of_real_networks(settings: dict[str, str]) -> None:
-    network = fold(make_agent(**settings))
+    network = fold_agent(make_agent(**settings))
     shapes = layer_shapes(network)
-    assert sum(shape.weights for shape in shapes) == sum(layer.weight.size for layer in network.layers)
+    assert sum(shape.weights for shape in shapes) == sum(node.weight.size for node in network.synapses)
     assert all(shape.weights == shape.units * shape.fan_in for shape in shapes)
     assert shapes[-1].output_shape == network.head.output_shape
-    dueling = network.layers[-2].groups == 2
+    dueling = network.layers[-1].synapses.groups == 2
     streams = ["hidden/value", "hidden/advantage"] if dueling else ["hidden"]
     first = "linear1" if settings.get("trunk") == "mlp" else "conv1"
     assert [shape.name for shape in shapes] == [first, *streams, "head"]
@@ -252,7 +252,7 @@ def test_shapes_of_real_networks(settings: dict[str, str]) -> None:
 
 def test_inputs_that_are_no_spikes_need_a_host() -> None:
     def host(chip: str, **settings: object) -> str:
-        return check_fit(layer_shapes(fold(make_agent(**settings))), chip).conditions[0]
+        return check_fit(layer_shapes(fold_agent(make_agent(**settings))), chip).conditions[0]
 
     assert "a host must compute conv1 (" in host("speck")
     assert "compute conv1, hidden, head (" in host("loihi-1", method="DQN")

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.counts.network import profile_task
 from switchmt_snn.export.counts.nir_file import profile_nir
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
 from switchmt_snn.export.parity.dyadic import dyadic_observations, exact_copy
 from switchmt_snn.export.runtimes.agents import encode
@@ -150,7 +150,7 @@ def exported(tmp_path: Path):
             agent.suite = replace(agent.suite, scale=0.5)
         agent, exact = exact_copy(agent, [x] * 3)
         assert exact
-        written = nir_graph(fold(agent), 1, profile or ("exact" if "subtract" in variant else "portable"))
+        written = nir_graph(fold_agent(agent), 1, profile or ("exact" if "subtract" in variant else "portable"))
         write_nir(written, tmp_path / "task.nir")
         return agent, x, tmp_path / "task.nir"
 

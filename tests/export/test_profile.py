@@ -20,7 +20,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export import profile, provenance
 from switchmt_snn.export.chips.precision import at_precision, effect_of_precision
 from switchmt_snn.export.counts.network import profile_task
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.runs.run import load_agent
 from tests.export.export_cases import VARIANTS, make_agent, observations
 from tests.export.test_export_command import call, run, trained  # noqa: F401
@@ -255,10 +255,10 @@ def test_the_commit_is_that_of_this_package_only(tmp_path: Path) -> None:
 def test_rounded_weights_are_those_of_a_layers_own_step() -> None:
     agent = make_agent()
     for task in range(3):
-        rounded = at_precision(fold(agent), task, 8)
-        for layer in rounded.layers:
-            weight, shift = layer.folded(task)
-            original, expected_shift = next(x for x in fold(agent).layers if x.name == layer.name).folded(task)
+        rounded = at_precision(fold_agent(agent), task, 8)
+        for node, trained_node in zip(rounded.synapses, fold_agent(agent).synapses, strict=True):
+            weight, shift = node.folded(task)
+            original, expected_shift = trained_node.folded(task)
             step = np.abs(original).max() / 127
             steps = np.abs(weight / step)
             assert np.allclose(steps, np.rint(steps), atol=1e-3)

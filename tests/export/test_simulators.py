@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from switchmt_snn.export.folding import fold
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations
 from switchmt_snn.export.runtimes.agents import encode, read_nir
@@ -28,7 +28,7 @@ def test_simulators_agree_bitwise(name: str, profile: str, method: str, tmp_path
     agent = dyadic_copy(make_agent(seed=2, method=method))
     x = dyadic_observations(observations(agent, 12, seed=2))
     for task in range(3):
-        write_nir(nir_graph(fold(agent), task, profile), tmp_path / "task.nir")  # type: ignore[arg-type]
+        write_nir(nir_graph(fold_agent(agent), task, profile), tmp_path / "task.nir")  # type: ignore[arg-type]
         graph = read_nir(tmp_path / "task.nir")
         encoded = encode(agent.suite, agent.config, x, 0)
         expected, recorded = NirInterpreter(graph, **simulator.interpreter).run(encoded, ["hidden_neurons"])
@@ -39,7 +39,7 @@ def test_simulators_agree_bitwise(name: str, profile: str, method: str, tmp_path
 def test_conventions_differ_where_they_are_said_to() -> None:
     """On exact numbers there are ties: > and >=, and the two resets, must not agree by accident."""
     agent = dyadic_copy(make_agent(seed=2))
-    graph = nir_graph(fold(agent), 0)
+    graph = nir_graph(fold_agent(agent), 0)
     encoded = encode(agent.suite, agent.config, dyadic_observations(observations(agent, 12, seed=2)), 0)
     outputs = [NirInterpreter(graph, **simulator.interpreter).run(encoded)[0] for simulator in SIMULATORS.values()]
     norse, nirtorch, spikingjelly, sinabs = outputs

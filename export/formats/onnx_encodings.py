@@ -1,0 +1,75 @@
+"""The encodings as ONNX operators: the computation of :mod:`switchmt_snn.spiking.encodings`."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+from onnx import helper
+
+from switchmt_snn.errors import ExportError
+from switchmt_snn.export.formats.onnx_graph import FLOAT, Graph
+from switchmt_snn.spiking.folding import FoldedNetwork
+
+
+def observation_input(network: FoldedNetwork) -> onnx.ValueInfoProto:
+    """Raw observations ``[B, *shape]``; under the random encoding, the spikes ``[T, B, *shape]`` that the host drew."""
+    if network.settings.encoding == "rate":
+        shape: list[str | int | None] = [network.settings.timesteps, "batch", *network.encoded_shape]
+        return helper.make_tensor_value_info("encoded", FLOAT, shape)
+    dtype = helper.np_dtype_to_tensor_dtype(np.dtype(network.observation_dtype))
+    return helper.make_tensor_value_info("observation", dtype, ["batch", *network.observation.shape])
+
+
+def encode(graph: Graph, network: FoldedNetwork) -> str:
+    """The encoded input: ``[B, ...]`` under direct encoding (the same at every step), else ``[T, B, ...]``.
+
+    Raises:
+        ExportError: an encoding without a rule.
+    """
+    encoding = network.settings.encoding
+    if encoding == "rate":
+        return "encoded"
+    raw = graph.add("Cast", ["observation"], "observation_float", to=FLOAT)
+    x = graph.add("Mul", [raw, graph.constant("scale", network.observation.scale)], "scaled")
+    if encoding == "direct":
+        return x
+    if encoding == "latency":
+        return _latency(graph, network, x)
+    if encoding == "frames":
+        return _frames(graph, network, x)
+    if encoding == "events":
+        return _events(graph, network, _frames(graph, network, x))
+    raise ExportError(
+        f"ONNX has no rule for network.encoding {encoding!r}, expected direct, rate, latency, frames or events; add "
+        "one to export/formats/onnx_encodings.py"
+    )
+
+
+def _latency(graph: Graph, network: FoldedNetwork, x: str) -> str:
+    T = network.settings.timesteps
+    dark = graph.add("Sub", [graph.constant("one", 1.0), x], "darkness")
+    when = graph.add("Round", [graph.add("Mul", [dark, graph.constant("last_step", T - 1)], "delay")], "when")
+    steps = np.arange(T).reshape(T, *(1,) * (1 + len(network.observation.shape)))
+    now = graph.add("Equal", [when, graph.constant("steps", steps)], "now")
+    lit = graph.add("Greater", [x, graph.constant("zero", 0.0)], "lit")
+    return graph.add("Cast", [graph.add("And", [now, lit], "fires")], "encoded", to=FLOAT)
+
+
+def _frames(graph: Graph, network: FoldedNetwork, x: str) -> str:
+    stack, (channels, *rest) = network.observation.frame_stack, network.observation.shape
+    shape = [0, stack, channels // stack, *rest]
+    unstacked = graph.add("Reshape", [x, graph.constant("unstack", shape, np.int64)], "unstacked")
+    return graph.add("Transpose", [unstacked], "frames", perm=[1, 0, *range(2, 3 + len(rest))])
+
+
+def _events(graph: Graph, network: FoldedNetwork, frames: str) -> str:
+    start, end, axis = (graph.constant(n, [v], np.int64) for n, v in (("at_0", 0), ("at_last", -1), ("axis_0", 0)))
+    older = graph.add("Slice", [frames, start, end, axis], "older")
+    first = graph.add("Slice", [frames, start, graph.constant("at_1", [1], np.int64), axis], "first")
+    darkness = graph.add("Mul", [first, graph.constant("zero", 0.0)], "darkness")
+    before = graph.add("Concat", [darkness, older], "before", axis=0)
+    change = graph.add("Sub", [frames, before], "change")
+    threshold = network.settings.event_threshold
+    on = graph.add("Greater", [change, graph.constant("on_above", threshold)], "on")
+    off = graph.add("Less", [change, graph.constant("off_below", -threshold)], "off")
+    return graph.add("Cast", [graph.add("Concat", [on, off], "events", axis=2)], "encoded", to=FLOAT)
