@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 from switchmt_snn.tasks.registry import make_suite
+
+RunCommand = Callable[..., tuple[str, str]]
+"""See :func:`tests.export.conftest.run_command`."""
 
 STACKED = {"frame_stack": 4}
 VARIANTS: dict[str, dict[str, Any]] = {

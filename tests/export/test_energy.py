@@ -12,7 +12,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.counts.network import LayerProfile, TaskProfile
 from switchmt_snn.export.energy.estimate import Memory, Target, builtin_targets, estimate, load_target, read_target
 from switchmt_snn.export.yaml_files import parse
-from tests.export.test_export_command import call, run, trained  # noqa: F401
+from tests.export.export_cases import RunCommand
 
 TEXTS = dict.fromkeys(("name", "title", "chip", "process", "source", "includes", "leaves_out"), "x")
 TARGET = {**TEXTS, "evidence": "measured", "unit": "pJ", "operations": {"ac": 2.0, "mac": 10.0, "neuron_update": 3.0}}
@@ -187,18 +187,18 @@ def test_a_missing_source_and_text_that_is_no_target(tmp_path: Path) -> None:
         load_target(str(tmp_path / "latin.yaml"))
 
 
-def test_a_target_of_ones_own(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+def test_a_target_of_ones_own(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     (tmp_path / "chip.yaml").write_text(make(name="my-chip"))
-    out, _ = call(
-        capsys, "profile", run, "--decisions", 20, "--target", tmp_path / "chip.yaml", "--target", "loihi-2018"
+    out, _ = run_command(
+        "profile", trained_run, "--decisions", 20, "--target", tmp_path / "chip.yaml", "--target", "loihi-2018"
     )
     assert "my-chip" in out
     assert "loihi-2018" in out
     assert "cmos45-fp32" not in out
     assert "The spiking network costs" in out
     (tmp_path / "twin.yaml").write_text(make(name="loihi-2018"))
-    _, err = call(capsys, "profile", run, "--target", tmp_path / "twin.yaml", "--target", "loihi-2018", code=2)
+    _, err = run_command("profile", trained_run, "--target", tmp_path / "twin.yaml", "--target", "loihi-2018", code=2)
     assert "two targets have one name" in err
     (tmp_path / "chip.yaml").write_text(make(unit="eV"))
-    _, err = call(capsys, "profile", run, "--target", tmp_path / "chip.yaml", code=2)
+    _, err = run_command("profile", trained_run, "--target", tmp_path / "chip.yaml", code=2)
     assert "unit is 'eV'" in err

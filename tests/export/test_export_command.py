@@ -3,57 +3,18 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-from switchmt_snn.cli import main
-
-CONFIG = {
-    "name": "exported",
-    "seed": 5,
-    "total_steps": 600,
-    "threads": 1,
-    "device": "cpu",
-    "tasks": {"suite": "minatar", "names": ["breakout", "asterix"], "num_envs": 2},
-    "network": {"hidden_units": 16, "timesteps": 2},
-    "learning": {"batch_size": 8, "learning_starts_steps": 50, "replay_capacity_steps": 600, "update_every_steps": 4},
-    "switching": {"max_stay_steps": 100},
-    "evaluation": {"episodes": 2, "num_envs": 2},
-}
+from tests.export.export_cases import RunCommand
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("export")
-    (folder / "config.yaml").write_text(yaml.safe_dump(CONFIG))
-    with pytest.raises(SystemExit) as stop:
-        main(["train", str(folder / "config.yaml"), "--run", str(folder / "run")])
-    assert stop.value.code == 0
-    return folder / "run"
-
-
-@pytest.fixture
-def run(trained: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(trained, tmp_path / "run"))
-
-
-def call(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -> tuple[str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    out, err = capsys.readouterr()
-    assert stop.value.code == code, err
-    assert "Traceback" not in err
-    return out, err
-
-
-def test_export_writes_checks_and_the_files_play(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, _ = call(capsys, "export", run, "--onnx", "--nir", "--task", "asterix", "--parity-decisions", 200)
+def test_export_writes_checks_and_the_files_play(trained_run: Path, run_command: RunCommand) -> None:
+    out, _ = run_command("export", trained_run, "--onnx", "--nir", "--task", "asterix", "--parity-decisions", 200)
     assert "Parity with the trained network" in out
-    folder = run / "export"
+    folder = trained_run / "export"
     assert {path.name for path in folder.iterdir()} == {
         "decision.onnx",
         "decision_asterix.onnx",
@@ -81,72 +42,74 @@ def test_export_writes_checks_and_the_files_play(run: Path, capsys: pytest.Captu
     assert beside["config_sha256"] == parity["config_sha256"]
     scores = {}
     for engine in ("torch", "onnx", "nir"):
-        out, _ = call(capsys, "evaluate", run, "--engine", engine, "--episodes", 4, "--json")
+        out, _ = run_command("evaluate", trained_run, "--engine", engine, "--episodes", 4, "--json")
         result = json.loads(out)
         scores[engine] = [(row["task"], row["mean"], row["mean_length_steps"]) for row in result["tasks"]]
         assert engine == "torch" or result["equal_actions_share"] == 1.0
     assert scores["torch"] == scores["onnx"] == scores["nir"]
     assert json.loads((folder / "evaluation_nir.json").read_text())["equal_actions_share"] == 1.0
-    out, _ = call(capsys, "evaluate", run, "--engine", "onnx", "--episodes", 2, "--task", "asterix")
+    out, _ = run_command("evaluate", trained_run, "--engine", "onnx", "--episodes", 2, "--task", "asterix")
     assert "100.00% of its decisions are those of the trained network" in out
 
 
-def test_without_a_format_everything_that_fits_is_written(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, _ = call(capsys, "export", run, "--parity-decisions", 20, "--out", run / "elsewhere", "--int8", "--json")
+def test_without_a_format_everything_that_fits_is_written(trained_run: Path, run_command: RunCommand) -> None:
+    out, _ = run_command(
+        "export", trained_run, "--parity-decisions", 20, "--out", trained_run / "elsewhere", "--int8", "--json"
+    )
     result = json.loads(out)
     assert set(result["files"]) == {"decision.onnx", "step.onnx", "breakout.nir", "asterix.nir"}
     assert [row["equal_actions_share"] for row in result["parity"]["int8_storage"]] == [1.0, 1.0]
-    assert (run / "elsewhere" / "decision.onnx").stat().st_size < (run / "elsewhere" / "breakout.nir").stat().st_size
+    assert (trained_run / "elsewhere" / "decision.onnx").stat().st_size < (
+        trained_run / "elsewhere" / "breakout.nir"
+    ).stat().st_size
 
 
-def test_recorded_play_is_real_kept_and_checked(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    call(capsys, "export", run, "--onnx", "--parity-decisions", 50)
-    first = run / "recordings" / "breakout-step-600.npz"
+def test_recorded_play_is_real_kept_and_checked(trained_run: Path, run_command: RunCommand) -> None:
+    run_command("export", trained_run, "--onnx", "--parity-decisions", 50)
+    first = trained_run / "recordings" / "breakout-step-600.npz"
     with np.load(first) as stored:
         observations, actions = stored["observations"], stored["actions"]
     assert len(observations) == len(actions) == 52  # four copies of the task, whole steps
     assert len(np.unique(observations.reshape(52, -1), axis=0)) >= 10
     before = first.stat().st_mtime_ns
-    call(capsys, "export", run, "--onnx", "--parity-decisions", 40)
+    run_command("export", trained_run, "--onnx", "--parity-decisions", 40)
     assert first.stat().st_mtime_ns == before
     first.write_bytes(b"not an archive")
-    _, err = call(capsys, "export", run, "--onnx", "--parity-decisions", 40, code=2)
+    _, err = run_command("export", trained_run, "--onnx", "--parity-decisions", 40, code=2)
     assert "cannot be read" in err
     assert "delete it" in err
 
 
-def test_wrong_use_is_one_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     for words, message in (
         ((tmp_path / "nowhere",), "no run folder"),
-        ((run, "--task", "pong"), "unknown task 'pong'"),
-        ((run, "--nir-profile", "exakt"), "exakt"),
-        ((run, "--nir", "--task", "asterix"), "expected --onnx with it"),
-        ((run, "--parity-decisions", "0"), "parity_decisions is 0, expected at least 1"),
-        ((run, "--out", run / "config.yaml"), "config.yaml"),
-        ((run, "--checkpoint", "best"), "no whole best checkpoint"),
+        ((trained_run, "--task", "pong"), "unknown task 'pong'"),
+        ((trained_run, "--nir-profile", "exakt"), "exakt"),
+        ((trained_run, "--nir", "--task", "asterix"), "expected --onnx with it"),
+        ((trained_run, "--parity-decisions", "0"), "parity_decisions is 0, expected at least 1"),
+        ((trained_run, "--out", trained_run / "config.yaml"), "config.yaml"),
+        ((trained_run, "--checkpoint", "best"), "no whole best checkpoint"),
     ):
-        _, err = call(capsys, "export", *words, code=2)
+        _, err = run_command("export", *words, code=2)
         assert message in err
         assert len(err.strip().splitlines()) == 1, err
-    _, err = call(capsys, "evaluate", run, "--engine", "onnx", code=2)
-    assert f"run switchmt-snn export {run} --onnx" in err
-    call(capsys, "export", run, "--onnx", "--parity-decisions", 20)
-    (run / "export" / "decision.onnx").write_bytes(b"damaged")
-    _, err = call(capsys, "evaluate", run, "--engine", "onnx", code=2)
+    _, err = run_command("evaluate", trained_run, "--engine", "onnx", code=2)
+    assert f"run switchmt-snn export {trained_run} --onnx" in err
+    run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
+    (trained_run / "export" / "decision.onnx").write_bytes(b"damaged")
+    _, err = run_command("evaluate", trained_run, "--engine", "onnx", code=2)
     assert "cannot be read" in err
 
 
-def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    call(capsys, "export", run, "--onnx", "--parity-decisions", 20)
-    call(capsys, "train", "--run", run, "--total-steps", 620)
-    _, err = call(capsys, "evaluate", run, "--engine", "onnx", code=2)
+def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(trained_run: Path, run_command: RunCommand) -> None:
+    run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
+    run_command("train", "--run", trained_run, "--total-steps", 620)
+    _, err = run_command("evaluate", trained_run, "--engine", "onnx", code=2)
     assert "of step 600, expected 620" in err
 
 
 def test_a_failed_parity_exits_1_and_names_the_layer(
-    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    trained_run: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A writer with a wrong threshold in one layer."""
     from switchmt_snn.export import export_run as command
@@ -157,26 +120,26 @@ def test_a_failed_parity_exits_1_and_names_the_layer(
     for module in (command, proof):
         monkeypatch.setattr(module, "decision_model", lambda n, task=None: decision_model(with_wrong_layer(n, 1), task))
         monkeypatch.setattr(module, "step_model", lambda n: step_model(with_wrong_layer(n, 1)))
-    _, err = call(capsys, "export", run, "--onnx", "--parity-decisions", 20, code=1)
+    _, err = run_command("export", trained_run, "--onnx", "--parity-decisions", 20, code=1)
     assert "parity failed" in err
     assert "first in layer hidden" in err
-    assert json.loads((run / "export" / "parity.json").read_text())["failures"]
+    assert json.loads((trained_run / "export" / "parity.json").read_text())["failures"]
 
 
-def test_the_same_from_python(run: Path) -> None:
+def test_the_same_from_python(trained_run: Path) -> None:
     """A run folder, an agent and a bare network."""
     from switchmt_snn import load_agent
     from switchmt_snn.errors import ExportError, TaskError
     from switchmt_snn.export import check_parity, to_nir, to_onnx
 
-    agent = load_agent(run, device="cpu")
-    from_run, from_agent = (to_onnx(source).SerializeToString() for source in (run, agent))
+    agent = load_agent(trained_run, device="cpu")
+    from_run, from_agent = (to_onnx(source).SerializeToString() for source in (trained_run, agent))
     assert from_run == from_agent
-    assert to_nir(run, "asterix").metadata["task"] == "asterix"
+    assert to_nir(trained_run, "asterix").metadata["task"] == "asterix"
     assert "task" not in [value.name for value in to_onnx(agent, task="asterix").graph.input]
-    assert [value.name for value in to_onnx(run, "step").graph.input][:2] == ["encoded", "task"]
+    assert [value.name for value in to_onnx(trained_run, "step").graph.input][:2] == ["encoded", "task"]
     with pytest.raises(TaskError, match="unknown task 'pong'"):
-        to_nir(run, "pong")
+        to_nir(trained_run, "pong")
     observations = {
         name: agent.suite.make(k, 1).reset(np.array([0]), np.array([0])) for k, name in enumerate(agent.suite.names)
     }

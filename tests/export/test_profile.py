@@ -22,8 +22,7 @@ from switchmt_snn.export.chips.precision import at_precision, effect_of_precisio
 from switchmt_snn.export.counts.network import profile_task
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.runs.run import load_agent
-from tests.export.export_cases import VARIANTS, make_agent, observations
-from tests.export.test_export_command import call, run, trained  # noqa: F401
+from tests.export.export_cases import VARIANTS, RunCommand, make_agent, observations
 
 
 def hooked_counts(agent, x: np.ndarray, task: int) -> dict[str, int]:
@@ -120,12 +119,12 @@ def test_wrong_observations_are_refused() -> None:
             profile_task(agent, 0, wrong)
 
 
-def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
-    out, _ = call(capsys, "profile", run, "--decisions", 50)
+def test_profile_command(trained_run: Path, run_command: RunCommand) -> None:
+    out, _ = run_command("profile", trained_run, "--decisions", 50)
     assert "breakout: per decision, mean of 52" in out
-    facts = json.loads((run / "profile" / "profile.json").read_text())
+    facts = json.loads((trained_run / "profile" / "profile.json").read_text())
     assert facts["schema"] == 2
-    with (run / "profile" / "layers.csv").open(newline="") as stream:
+    with (trained_run / "profile" / "layers.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     for task in facts["tasks"]:
         for layer in task["layers"]:
@@ -135,109 +134,111 @@ def test_profile_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
             task["per_decision"]["acs"] + task["per_decision"]["macs"]
         )
         assert sum(int(row["spikes"]) for row in mine) / 52 == pytest.approx(task["per_decision"]["spikes"])
-    out, _ = call(capsys, "profile", run, "--decisions", 50, "--json")
+    out, _ = run_command("profile", trained_run, "--decisions", 50, "--json")
     assert {**json.loads(out), "created": ""} == {**facts, "created": ""}
-    _, err = call(capsys, "profile", run, "--decisions", 0, code=2)
+    _, err = run_command("profile", trained_run, "--decisions", 0, code=2)
     assert "decisions is 0, expected 1 to 10,000,000" in err
 
 
-def test_chips_and_targets_are_chosen_by_name(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
-    out, _ = call(capsys, "profile", run, "--decisions", 20, "--target", "speck")
+def test_chips_and_targets_are_chosen_by_name(trained_run: Path, run_command: RunCommand) -> None:
+    out, _ = run_command("profile", trained_run, "--decisions", 20, "--target", "speck")
     assert "speck" in out
-    facts = json.loads((run / "profile" / "profile.json").read_text())
+    facts = json.loads((trained_run / "profile" / "profile.json").read_text())
     assert ([chip["chip"] for chip in facts["chips"]], facts["targets"]) == (["speck"], {})
     assert facts["chips"][0]["fits"], "16 hidden units of a MinAtar network"
     assert facts["tasks"][0]["precision"][0]["bits"] == 8
-    _, err = call(capsys, "profile", run, "--target", "spekc", code=2)
+    _, err = run_command("profile", trained_run, "--target", "spekc", code=2)
     assert "unknown target 'spekc', expected a YAML file" in err
     assert "xylo-audio-3" in err, "all of them"
 
 
-def test_a_chip_of_ones_own_is_checked(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+def test_a_chip_of_ones_own_is_checked(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     """From the command line and from Python: a small copy of a built-in chip with weights of 4 bits."""
     text = (Path(__file__).parents[2] / "export" / "chips" / "builtin" / "loihi-1.yaml").read_text()
     text = text.replace("name: loihi-1", "name: my-chip").replace("cores: 128", "cores: 2")
     (tmp_path / "my.yaml").write_text(text.replace("weight_bits: 8", "weight_bits: 4"))
-    out, _ = call(capsys, "profile", run, "--decisions", 20, "--target", tmp_path / "my.yaml", "--target", "speck")
+    out, _ = run_command(
+        "profile", trained_run, "--decisions", 20, "--target", tmp_path / "my.yaml", "--target", "speck"
+    )
     assert "my-chip" in out
-    facts = profile(run, decisions=20, targets=[str(tmp_path / "my.yaml")]).facts
+    facts = profile(trained_run, decisions=20, targets=[str(tmp_path / "my.yaml")]).facts
     assert [(chip["chip"], chip["fits"], chip["weight_bits"]) for chip in facts["chips"]] == [("my-chip", False, 4)]
     assert [effect["bits"] for effect in facts["tasks"][0]["precision"]] == [4]
     (tmp_path / "my.yaml").write_text(text.replace("neurons: [IF, LIF, Synaptic]", "neurons: [LIF]"))
-    out, _ = call(capsys, "profile", run, "--decisions", 20, "--target", tmp_path / "my.yaml")
+    out, _ = run_command("profile", trained_run, "--decisions", 20, "--target", tmp_path / "my.yaml")
     assert "not held: neuron kind IF" in " ".join(out.split())
     (tmp_path / "my.yaml").write_text(text.replace("rule: fan_in", "rule: fan_inn"))
-    _, err = call(capsys, "profile", run, "--target", tmp_path / "my.yaml", code=2)
+    _, err = run_command("profile", trained_run, "--target", tmp_path / "my.yaml", code=2)
     assert "did you mean 'fan_in'?" in err
     assert len(err.strip().splitlines()) == 1
 
 
-def test_energy_per_episode_needs_an_evaluation_at_this_step(run: Path) -> None:  # noqa: F811
+def test_energy_per_episode_needs_an_evaluation_at_this_step(trained_run: Path) -> None:
     (row,) = [
         row
-        for path in (run / "evaluations").glob("*.json")
+        for path in (trained_run / "evaluations").glob("*.json")
         for row in json.loads(path.read_text())["tasks"]
         if (row["policy"], row["task"]) == ("agent", "breakout")
     ]
-    task = profile(run, decisions=20).facts["tasks"][0]
+    task = profile(trained_run, decisions=20).facts["tasks"][0]
     assert task["evaluation"]["decisions_per_episode"] == row["mean_length_steps"]
     assert task["evaluation"]["score"] == row["mean"]
     assert task["energy"][0]["per_episode_pj"] == task["energy"][0]["total_pj"] * row["mean_length_steps"]
     assert task["energy"][0]["power_uw"] is None, "MinAtar has no frames per second"
-    for path in (run / "evaluations").glob("*.json"):
+    for path in (trained_run / "evaluations").glob("*.json"):
         path.write_text("{}")
     with pytest.raises(ExportError, match="expected an evaluation; delete it"):
-        profile(run, decisions=20)
-    shutil.rmtree(run / "evaluations")
-    task = profile(run, decisions=20).facts["tasks"][0]
+        profile(trained_run, decisions=20)
+    shutil.rmtree(trained_run / "evaluations")
+    task = profile(trained_run, decisions=20).facts["tasks"][0]
     assert (task["evaluation"], task["energy"][0]["per_episode_pj"]) == (None, None)
 
 
-def test_decisions_are_the_same_from_a_longer_recording(run: Path) -> None:  # noqa: F811
+def test_decisions_are_the_same_from_a_longer_recording(trained_run: Path) -> None:
     def counts(decisions: int) -> list:
-        return [task["layers"] for task in profile(run, decisions=decisions).facts["tasks"]]
+        return [task["layers"] for task in profile(trained_run, decisions=decisions).facts["tasks"]]
 
     first = counts(60)
     counts(120)
     assert counts(60) == first
-    shutil.rmtree(run / "recordings")
+    shutil.rmtree(trained_run / "recordings")
     assert counts(60) == first
 
 
-def test_long_profiles_count_while_they_play(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    kept = profile(run, decisions=400).facts["tasks"]
-    shutil.rmtree(run / "recordings")
+def test_long_profiles_count_while_they_play(trained_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = profile(trained_run, decisions=400).facts["tasks"]
+    shutil.rmtree(trained_run / "recordings")
     monkeypatch.setattr("switchmt_snn.export.profile_run.KEPT_DECISIONS", 40)
-    streamed = profile(run, decisions=400).facts["tasks"]
+    streamed = profile(trained_run, decisions=400).facts["tasks"]
     assert [task["layers"] for task in streamed] == [task["layers"] for task in kept]
     assert [task["precision"][0]["decisions"] for task in streamed] == [40, 40]
 
 
-def test_a_network_without_a_voice_and_an_ann_say_so(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    agent = load_agent(run, "last", "cpu")
+def test_a_network_without_a_voice_and_an_ann_say_so(trained_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = load_agent(trained_run, "last", "cpu")
     with torch.no_grad():
         for stream in agent.network.streams.values():
             stream.neurons.leaky.threshold.fill_(1e6)
     monkeypatch.setattr("switchmt_snn.export.profile_run.load_agent", lambda *_: agent)
-    facts = profile(run, decisions=20).facts
+    facts = profile(trained_run, decisions=20).facts
     assert facts["headline"].startswith("No neuron fires in hidden in breakout, hidden in asterix: Q does not depend")
     ann = make_agent(method="DQN_D", tasks={"names": ["breakout", "asterix"]})
     monkeypatch.setattr("switchmt_snn.export.profile_run.load_agent", lambda *_: ann)
-    facts = profile(run, decisions=20).facts
+    facts = profile(trained_run, decisions=20).facts
     assert facts["headline"].startswith("This is an ANN")
     assert facts["chips"] == []
     assert set(facts["targets"]) == {"cmos45-fp32", "cmos45-int8"}, "only those that multiply"
 
 
 def test_an_out_that_cannot_be_written_to_is_refused_first(
-    run: Path,  # noqa: F811
+    trained_run: Path,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    run_command: RunCommand,
 ) -> None:
     (tmp_path / "file").write_text("")
-    _, err = call(capsys, "profile", run, "--out", tmp_path / "file" / "inside", code=2)
+    _, err = run_command("profile", trained_run, "--out", tmp_path / "file" / "inside", code=2)
     assert "cannot be written to" in err
-    assert not (run / "recordings").exists()
+    assert not (trained_run / "recordings").exists()
 
 
 def test_the_commit_is_that_of_this_package_only(tmp_path: Path) -> None:
@@ -271,28 +272,28 @@ def test_rounded_weights_are_those_of_a_layers_own_step() -> None:
 
 
 def test_bad_profiles_are_refused_in_one_line(
-    run: Path,  # noqa: F811
+    trained_run: Path,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    run_command: RunCommand,
 ) -> None:
-    _, err = call(capsys, "profile", tmp_path / "nothing.nir", "--observations", tmp_path / "x.npz", code=2)
+    _, err = run_command("profile", tmp_path / "nothing.nir", "--observations", tmp_path / "x.npz", code=2)
     assert "cannot be read" in err
-    _, err = call(capsys, "profile", run, "--observations", tmp_path / "x.npz", code=2)
+    _, err = run_command("profile", trained_run, "--observations", tmp_path / "x.npz", code=2)
     assert "belong together" in err
-    _, err = call(capsys, "profile", tmp_path / "graph.nir", code=2)
+    _, err = run_command("profile", tmp_path / "graph.nir", code=2)
     assert "belong together" in err
-    recording = run / "recordings" / "breakout-step-600.npz"
+    recording = trained_run / "recordings" / "breakout-step-600.npz"
     recording.parent.mkdir(exist_ok=True)
     recording.write_bytes(b"PK damaged")
-    _, err = call(capsys, "profile", run, code=2)
+    _, err = run_command("profile", trained_run, code=2)
     assert "cannot be read" in err
 
 
-def test_weights_that_are_not_numbers_are_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    agent = load_agent(run, "last", "cpu")
+def test_weights_that_are_not_numbers_are_refused(trained_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = load_agent(trained_run, "last", "cpu")
     with torch.no_grad():
         agent.network.streams["value"].head.weight[0, 0] = torch.nan
     monkeypatch.setattr("switchmt_snn.export.profile_run.load_agent", lambda *_: agent)
     with pytest.raises(ExportError, match="not finite"):
-        profile(run)
-    assert not (run / "profile").exists()
+        profile(trained_run)
+    assert not (trained_run / "profile").exists()

@@ -15,7 +15,7 @@ import pytest
 
 from switchmt_snn.export import profile
 from switchmt_snn.export.report.page import FILTERS, render_report
-from tests.export.test_export_command import call, run, trained  # noqa: F401
+from tests.export.export_cases import RunCommand
 
 TEMPLATE = Path(__file__).parents[2] / "export" / "report" / "templates" / "report.html.jinja"
 NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]\d+)?%?")
@@ -92,13 +92,14 @@ def all_lists(value: Any) -> Iterator[list[Any]]:
 
 
 @pytest.fixture(scope="module")
-def profiled(trained: Path) -> Path:  # noqa: F811
-    return profile(trained, decisions=40).folder
+def profiled(trained_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = shutil.copytree(trained_once, tmp_path_factory.mktemp("profiled") / "run")
+    return profile(run, decisions=40).folder
 
 
-def test_every_number_is_in_profile_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
-    out, _ = call(capsys, "profile", run, "--decisions", 40)
-    folder = run / "profile"
+def test_every_number_is_in_profile_json(trained_run: Path, run_command: RunCommand) -> None:
+    out, _ = run_command("profile", trained_run, "--decisions", 40)
+    folder = trained_run / "profile"
     facts = json.loads((folder / "profile.json").read_text())
     page = check(folder / "report.html", facts)
     text = " ".join(page.text)
@@ -120,19 +121,21 @@ def test_a_number_that_is_not_in_profile_json_would_be_noticed(profiled: Path, t
         check(tmp_path / "changed.html", facts)
 
 
-def test_several_runs_in_one_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
-    shutil.rmtree(run / "profile", ignore_errors=True)
-    _, err = call(capsys, "profile", run, tmp_path / "nothing", code=2)
+def test_several_runs_in_one_report(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
+    shutil.rmtree(trained_run / "profile", ignore_errors=True)
+    _, err = run_command("profile", trained_run, tmp_path / "nothing", code=2)
     assert "no run folder" in err
-    assert not (run / "profile").exists(), "nothing is profiled before all are found"
-    out, _ = call(capsys, "profile", run, run, "--decisions", 20, "--target", "cmos45-int8", "--out", tmp_path)
+    assert not (trained_run / "profile").exists(), "nothing is profiled before all are found"
+    out, _ = run_command(
+        "profile", trained_run, trained_run, "--decisions", 20, "--target", "cmos45-int8", "--out", tmp_path
+    )
     assert "Per decision, smallest to largest" in out
     facts = json.loads((tmp_path / "comparison.json").read_text())
     assert len(facts["runs"]) == 2
     text = " ".join(check(tmp_path / "comparison.html", facts).text)
     assert "2 runs side by side" in text
-    assert (run / "profile" / "report.html").exists()
-    out, _ = call(capsys, "profile", run, run, "--decisions", 20, "--out", tmp_path, "--json")
+    assert (trained_run / "profile" / "report.html").exists()
+    out, _ = run_command("profile", trained_run, trained_run, "--decisions", 20, "--out", tmp_path, "--json")
     assert json.loads(out) == json.loads((tmp_path / "comparison.json").read_text())
 
 
