@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from switchmt_snn.native.products import Panels
-from switchmt_snn.runs.folder import processor
+from switchmt_snn.runs.environment import processor
 
 PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "ale-py", "zstandard", "onnxruntime")
 

@@ -30,8 +30,9 @@ from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_pl
 from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.selection import Selection
+from switchmt_snn.runs.environment import command_line
 from switchmt_snn.runs.files import write_atomically
-from switchmt_snn.runs.folder import RunFolder, command_line, latest_run
+from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.tasks.registry import suite_of
 

@@ -383,7 +383,7 @@ def _doctor(argv: list[str]) -> int:
 
     from switchmt_snn.machine.devices import has_bfloat16, select_device
     from switchmt_snn.machine.memory import GIB, available_bytes
-    from switchmt_snn.runs.folder import describe_environment
+    from switchmt_snn.runs.environment import describe_environment
     from switchmt_snn.tasks.registry import SUITES
     from switchmt_snn.updates.choice import built_engines
 

@@ -49,13 +49,6 @@ class ExperimentConfig:
         require(self.total_steps >= 1, "total_steps", self.total_steps, "at least 1")
         require(self.threads is None or self.threads >= 1, "threads", self.threads, "at least 1 or null")
         stack = resolved_frame_stack(self.tasks)
-        if self.network.encoding in ("frames", "events"):
-            require(
-                self.network.timesteps == stack,
-                "network.timesteps",
-                self.network.timesteps,
-                f"tasks.frame_stack ({stack}) for encoding={self.network.encoding}, one stacked frame per step",
-            )
         per_env = self.learning.replay_capacity_steps // self.tasks.num_envs
         require(
             per_env > stack,

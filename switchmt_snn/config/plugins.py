@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
 from typing import Any, NewType
+
+import yaml
 
 from switchmt_snn.errors import ConfigError
 
@@ -31,7 +38,7 @@ def load_plugin(name: str, key: str) -> Any:
     """
     module_name, _, attribute = name.partition(":")
     try:
-        module = importlib.import_module(module_name)
+        module = _script() if module_name == _script_name() else _imported(module_name)
     except ImportError as error:
         raise ConfigError(
             f"{key} is {name!r}, expected an importable module, but importing {module_name!r} fails ({error}); "
@@ -49,13 +56,65 @@ def load_plugin(name: str, key: str) -> Any:
 def plugin_name(plugin: type[Any], key: str) -> PluginName:
     """The ``package.module:Name`` by which :func:`load_plugin` finds a class again.
 
+    A class of the script that runs gets the script's name: ``own_policy:MyCriterion`` in ``python own_policy.py``.
+
     Raises:
         ConfigError: the class is local to a function or nested in a class, so no config can name it.
     """
-    name = f"{plugin.__module__}:{plugin.__qualname__}"
+    module_name = _script_name() or "__main__" if plugin.__module__ == "__main__" else plugin.__module__
+    name = f"{module_name}:{plugin.__qualname__}"
     if not is_plugin(name):
         raise ConfigError(
-            f"{key} is the local class {plugin.__qualname__!r}, expected a class at the top level of a module; a run "
-            "stores its name, so that it can be resumed"
+            f"{key} is {plugin.__qualname__} of the module {module_name!r}, expected a class at the top level of a "
+            "module that can be imported; a run stores its name, so that it can be resumed"
         )
     return PluginName(name)
+
+
+def plugin_options(options: Sequence[str], key: str) -> dict[str, bool | int | float | str]:
+    """Keyword arguments of a plugin from ``name=value`` texts; a value is read as YAML reads it.
+
+    Raises:
+        ConfigError: a text has no name or no plain value, or a name comes twice.
+    """
+    arguments: dict[str, bool | int | float | str] = {}
+    for option in options:
+        name, equals, text = option.partition("=")
+        value = _plain(text)
+        if not (equals and name.isidentifier()) or value is None or name in arguments:
+            raise ConfigError(f"{key} has {option!r}, expected name=value with a plain value, each name once")
+        arguments[name] = value
+    return arguments
+
+
+def _plain(text: str) -> bool | int | float | str | None:
+    """A number, a truth value or text; None for anything else."""
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):  # YAML 1.1 reads 1e-4 (no dot) as text
+            return float(value)
+    return value if isinstance(value, (bool, int, float, str)) else None
+
+
+def _imported(module_name: str) -> ModuleType:
+    """Import a module; the current folder is searched last, so that ``switchmt-snn`` finds modules that lie in it."""
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return importlib.import_module(module_name)
+
+
+def _script() -> ModuleType:
+    return sys.modules["__main__"]
+
+
+def _script_name() -> str | None:
+    """The name under which the running script can be imported; None for an interactive session."""
+    script = _script()
+    if getattr(script, "__spec__", None) is not None:
+        return str(script.__spec__.name)  # type: ignore[union-attr]
+    path = getattr(script, "__file__", None)
+    return None if path is None else Path(path).stem

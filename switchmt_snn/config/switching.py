@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from switchmt_snn.config.checks import check_fields, require
-from switchmt_snn.config.plugins import PluginName
+from switchmt_snn.config.plugins import PluginName, is_plugin, plugin_options
 
 Policy = Literal[
     "fixed_episodes",
@@ -25,8 +25,11 @@ class SwitchingConfig:
     """When training leaves a task (paper, Algorithm 1 and Eq. 3; docs/algorithm.md, Switching policies)."""
 
     policy: Literal["auto"] | Policy | PluginName = "auto"
-    """fixed_episodes, fixed_steps, interleave, parameter_change (Eq. 3), parameter_change_per_update, reward_plateau or
-    parameter_and_reward; auto takes the method's own (SwitchMT: parameter_change, all others: fixed_episodes)."""
+    """fixed_episodes, fixed_steps, interleave, parameter_change (Eq. 3), parameter_change_per_update, reward_plateau,
+    parameter_and_reward, or a class from outside the package, package.module:Class (docs/extending.md). auto: the
+    method's own (SwitchMT: parameter_change, all others: fixed_episodes)."""
+    options: tuple[str, ...] = ()
+    """policy=package.module:Class: keyword arguments of the class, each as name=value. The other policies have none."""
     visit_episodes: int = 25
     """fixed_episodes: episodes per visit."""
     visit_steps: int = 10_000
@@ -52,6 +55,9 @@ class SwitchingConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, "switching")
+        fits = not self.options or is_plugin(self.policy)
+        require(fits, "switching.options", self.options, f"none for policy {self.policy}")
+        plugin_options(self.options, "switching.options")
         for name in ("visit_episodes", "visit_steps", "window_episodes", "plateau_patience_episodes"):
             value = getattr(self, name)
             require(value >= 1, f"switching.{name}", value, "at least 1")

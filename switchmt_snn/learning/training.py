@@ -1,12 +1,12 @@
 """Algorithm 1 of the paper: one spiking Q-network learns several tasks and switches between them.
 
-The loop is a generator of events. It knows no screen and no file format; whoever drives it decides when to save
-(:class:`Training` is stateful, and whole whenever a :class:`Stepped` event is yielded) and when to stop.
+:meth:`Training.events` is the loop: a generator of events. It knows no screen and no file. Its caller decides when to
+save and when to stop; the state is whole whenever a :class:`Stepped` event is yielded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -17,8 +17,9 @@ import torch
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.clocks import Every, linear_decay
-from switchmt_snn.learning.events import EpisodeEnded, Event, LayerHealth, Measured, Stepped, SwitchDecided
+from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.measuring import layer_health
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
@@ -29,32 +30,6 @@ from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite, VectorStep
 from switchmt_snn.updates.processes import ProcessGroup
-
-HEALTH_BATCH = 32
-
-
-def observation_spec(suite: TaskSuite) -> ObservationSpec:
-    """What the network must know of a suite."""
-    return ObservationSpec(
-        shape=suite.observation_shape,
-        frame_stack=suite.frame_stack,
-        scale=suite.scale,
-        in_unit_range=suite.in_unit_range,
-        num_actions=suite.num_actions,
-        num_tasks=len(suite.names),
-    )
-
-
-def make_learner(
-    config: ExperimentConfig, suite: TaskSuite, device: torch.device, group: ProcessGroup | None = None
-) -> Learner:
-    """A run's learner with its fresh network; the same in every process of a group, but for the encoding's numbers."""
-    network_seed, _, _, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
-    network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
-    encode = int(encode_seed.generate_state(1)[0]) + (0 if group is None else group.rank)
-    if group is None:
-        return Learner(network, config.learning, suite.valid_actions_KA, device, encode)
-    return SharedLearner(network, config.learning, suite.valid_actions_KA, device, encode, group)
 
 
 class Training(Stateful):
@@ -94,28 +69,18 @@ class Training(Stateful):
         Args:
             config: resolved.
             suite: its tasks.
-            device: where the network lies.
+            device: the network's.
             group: the processes among which updates are divided; None for one process.
+
+        Raises:
+            ConfigError: the network, the engine or the switching policy cannot be made.
         """
         self.config, self.suite = config, suite
         self.num_envs = config.tasks.num_envs
         num_tasks = len(suite.names)
         seeds = np.random.SeedSequence(config.seed).spawn(4)
-        self.learner = make_learner(config, suite, device, group)
-        learning = config.learning
-        self.replays = [
-            FrameReplay(
-                learning.replay_capacity_steps,
-                self.num_envs,
-                suite.frame_shape,
-                suite.frame_dtype,
-                suite.frame_stack,
-                compresses_replay(config, suite),
-                int(learning.replay_max_gib * GIB / num_tasks),
-                device if learning.replay_on_device else None,
-            )
-            for _ in suite.names
-        ]
+        self.learner = make_learner(config, suite, device, group)  # Q, Q*
+        self.replays = [make_replay(config, suite, device) for _ in suite.names]  # D_1 ... D_|E|
         self.policy = SwitchingPolicy(config.switching, num_tasks)
         self.task = 0
         self.visit = 0
@@ -127,8 +92,8 @@ class Training(Stateful):
         self.starts_by_task = [0] * num_tasks  # episodes that began; numbers their seeds
         self.explore_rng = np.random.default_rng(seeds[1])
         self.sample_rng = np.random.default_rng(seeds[2])
-        self.update_clock = Every(learning.update_every_steps)
-        self.target_clock = Every(learning.target_update_every_steps)
+        self.update_clock = Every(config.learning.update_every_steps)
+        self.target_clock = Every(config.learning.target_update_every_steps)
         self.metrics_clock = Every(config.recording.metrics_every_steps)
         self.reproducible = True
         self._thread: ThreadPoolExecutor | None = None
@@ -148,15 +113,9 @@ class Training(Stateful):
             warming_up = self.is_warming_up(task)
             actions = self.select_actions(play, 1.0 if warming_up else epsilon)  # a via epsilon-greedy
             if self.config.learning.overlap:
-                stepping = self._beside(play.step, actions)
-                self._learn()  # with what D_i held before this step
-                played = stepping.result()
-                self._remember(play, actions, played)
-                self._count_steps()
+                played = self._step_while_learning(play, actions)
             else:
-                played = play.step(actions)  # observe r and s'
-                self._remember(play, actions, played)  # store in D_i
-                self._count_steps()
+                played = self._store(actions, play.step(actions))  # observe r and s', store in D_i
                 self._learn()  # sample from D_i, gradient step
             yield from self._end_episodes(play, played, epsilon)  # terminal: H_i, Eq. 3, maybe i <- i + 1 mod |E|
             for _ in range(self.target_clock.advance(self.num_envs)):
@@ -185,25 +144,29 @@ class Training(Stateful):
             actions = np.where(explore, actions, greedy)
         return actions
 
-    def _beside(
-        self, step: Callable[[npt.NDArray[np.int64]], VectorStep], actions: npt.NDArray[np.int64]
-    ) -> Future[VectorStep]:
-        """Step the environments on another thread; they share nothing with the learner and the replay."""
+    def _step_while_learning(self, play: Play, actions: npt.NDArray[np.int64]) -> VectorStep:
+        """Step on another thread, and learn from what D_i held before the step (``learning.overlap``)."""
+        stepping = self._step_on_thread(play, actions)
+        self._learn()
+        return self._store(actions, stepping.result())
+
+    def _step_on_thread(self, play: Play, actions: npt.NDArray[np.int64]) -> Future[VectorStep]:
+        """Begin a step on another thread; the environments share nothing with the learner and the replay."""
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "environments")
-        return self._thread.submit(step, actions)
+        return self._thread.submit(play.step, actions)
 
-    def _remember(self, play: Play, actions: npt.NDArray[np.int64], played: VectorStep) -> None:
+    def _store(self, actions: npt.NDArray[np.int64], played: VectorStep) -> VectorStep:
+        """Store the transitions of a vector step in D_i, and count its steps."""
         replay = self.replays[self.task]
         for env in range(self.num_envs):
             replay.add(
                 env, int(actions[env]), float(played.rewards[env]), bool(played.terminated[env]), played.frames[env]
             )
-
-    def _count_steps(self) -> None:
         self.steps += self.num_envs
         self.steps_by_task[self.task] += self.num_envs
         self.steps_in_visit += self.num_envs
+        return played
 
     def _learn(self) -> None:
         """The updates that are due, from the current task's buffer or from every task's in turn."""
@@ -256,7 +219,7 @@ class Training(Stateful):
         return SwitchDecided(self.steps, self.task, self.visit, self.episodes_in_visit, self.steps_in_visit, decision)
 
     def _enter(self, task: int) -> None:
-        """Begin a visit; episodes that were running when the task was left go on where they paused."""
+        """Begin a visit. Episodes that were running when the task was left continue."""
         self.visit += 1
         self.task = task
         self.steps_in_visit = 0
@@ -290,13 +253,8 @@ class Training(Stateful):
         """
         self.check_finite()
         means = self.learner.take_means()
-        layers: dict[str, LayerHealth] = {}
         replay = self.replays[self.task]
-        if not self.is_warming_up(self.task):
-            newest = replay.valid_slots()[-HEALTH_BATCH:]
-            for name, rate in self.learner.firing_rates(replay.gather(newest).observations, self.task).items():
-                dead, saturated = float((rate == 0).float().mean()), float((rate >= 1).float().mean())
-                layers[name] = LayerHealth(float(rate.mean()), dead, saturated if self.learner.network.spiking else 0.0)
+        layers = {} if self.is_warming_up(self.task) else layer_health(self.learner, replay, self.task)
         return Measured(
             step=self.steps,
             task=self.task,
@@ -322,7 +280,7 @@ class Training(Stateful):
         return {**super().state_dict(), "plays": plays}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue a run; ``reproducible`` tells whether its episodes came back as they were."""
+        """Continue a run; ``reproducible`` says whether its episodes repeated themselves from seed and actions."""
         super().load_state_dict(state)
         replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]
         self.reproducible = all(replayed)
@@ -334,3 +292,45 @@ class Training(Stateful):
         for play in self._plays.values():
             play.close()
         self.learner.close()
+
+
+def observation_spec(suite: TaskSuite) -> ObservationSpec:
+    """What the network must know of a suite."""
+    return ObservationSpec(
+        shape=suite.observation_shape,
+        frame_stack=suite.frame_stack,
+        scale=suite.scale,
+        in_unit_range=suite.in_unit_range,
+        num_actions=suite.num_actions,
+        num_tasks=len(suite.names),
+    )
+
+
+def make_learner(
+    config: ExperimentConfig, suite: TaskSuite, device: torch.device, group: ProcessGroup | None = None
+) -> Learner:
+    """A run's learner with a fresh network.
+
+    It is the same in every process of a group, except for the random numbers of the encoding.
+    """
+    network_seed, _, _, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
+    network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
+    encode = int(encode_seed.generate_state(1)[0]) + (0 if group is None else group.rank)
+    if group is None:
+        return Learner(network, config.learning, suite.valid_actions_KA, device, encode)
+    return SharedLearner(network, config.learning, suite.valid_actions_KA, device, encode, group)
+
+
+def make_replay(config: ExperimentConfig, suite: TaskSuite, device: torch.device) -> FrameReplay:
+    """The empty replay memory D of one task."""
+    learning = config.learning
+    return FrameReplay(
+        learning.replay_capacity_steps,
+        config.tasks.num_envs,
+        suite.frame_shape,
+        suite.frame_dtype,
+        suite.frame_stack,
+        compresses_replay(config, suite),
+        int(learning.replay_max_gib * GIB / len(suite.names)),
+        device if learning.replay_on_device else None,
+    )

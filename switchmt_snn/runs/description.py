@@ -71,7 +71,7 @@ def with_method(config: ExperimentConfig, method: str) -> ExperimentConfig:
     if not traits.spiking:
         changes |= {"encoding": "direct", "readout": "mean", "k_winners": None}
     network = replace(config.network, **changes)
-    return resolve(replace(config, network=network, switching=replace(config.switching, policy="auto")))
+    return resolve(replace(config, network=network, switching=replace(config.switching, policy="auto", options=())))
 
 
 def describe_method(config: ExperimentConfig, suite: TaskSuite) -> MethodDescription:

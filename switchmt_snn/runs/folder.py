@@ -6,62 +6,22 @@ config.yaml  environment.json  metrics.jsonl  episodes.csv  switches.csv  checkp
 from __future__ import annotations
 
 import csv
-import hashlib
-import importlib.metadata
 import io
 import json
-import os
-import platform
-import shlex
-import sys
 import time
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import filelock
-import torch
 
 from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
-from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDecided
-from switchmt_snn.learning.switching import SwitchTo
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.files import write_atomically
-from switchmt_snn.tasks.registry import SUITES, suite_of
 
 RUNS = Path("runs")
-EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncated", "epsilon", "updates", "wall_s")
-SWITCH_COLUMNS = (
-    "step",
-    "visit",
-    "task",
-    "episodes_in_visit",
-    "steps_in_visit",
-    "decision",
-    "next_task",
-    "reason",
-    "parameter_change",
-    "change_threshold",
-    "snapshots",
-    "updates_in_window",
-    "change_per_update",
-    "largest_change_per_update",
-    "change_rate_fraction",
-    "returns",
-    "reward_slope",
-    "reward_t",
-    "plateau_t",
-    "flat_episodes",
-    "parameter_says_leave",
-    "reward_says_leave",
-    "visit_episodes",
-    "visit_steps",
-)
-_PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "safetensors", "zstandard")
-"""Distributions whose versions a run stores, with those that suites name."""
 
 
 def new_run_path(name: str) -> Path:
@@ -203,133 +163,8 @@ class RunFolder:
         return {task: (values[:episodes], values[-episodes:]) for task, values in by_task.items()}
 
 
-class RunLogs:
-    """episodes.csv, switches.csv and metrics.jsonl of a running training: the truth that everything else shows."""
-
-    def __init__(self, folder: RunFolder, task_names: tuple[str, ...], sizes: dict[str, int] | None) -> None:
-        """Open the logs; ``sizes`` cuts them back to a checkpoint's moment, None begins them."""
-        self._tasks = task_names
-        self._started = time.monotonic()
-        self._files: dict[str, IO[str]] = {}
-        headers = {"episodes.csv": EPISODE_COLUMNS, "switches.csv": SWITCH_COLUMNS, "metrics.jsonl": ()}
-        for name, columns in headers.items():
-            stream = (folder.path / name).open("a", encoding="utf-8", newline="")
-            stream.truncate(sizes[name] if sizes else 0)
-            self._files[name] = stream
-            if columns and not sizes:
-                stream.write(",".join(columns) + "\n")
-
-    def __call__(self, event: Event) -> None:
-        """Write an event down."""
-        wall_s = round(time.monotonic() - self._started, 3)
-        if isinstance(event, EpisodeEnded):
-            row: Iterable[Any] = (
-                event.step,
-                self._tasks[event.task],
-                event.episode,
-                f"{event.episode_return:g}",
-                event.length_steps,
-                int(event.truncated),
-                f"{event.epsilon:.6g}",
-                event.updates,
-                wall_s,
-            )
-            self._row("episodes.csv", row)
-        elif isinstance(event, SwitchDecided):
-            self._row("switches.csv", self._switch_row(event))
-        elif isinstance(event, Measured):
-            record = {
-                "step": event.step,
-                "task": self._tasks[event.task],
-                "updates": event.updates,
-                "loss": event.loss,
-                "q": event.q,
-                "steps_by_task": dict(zip(self._tasks, event.steps_by_task, strict=True)),
-                "layers": {name: asdict(health) for name, health in event.layers.items()},
-                "wall_s": wall_s,
-            }
-            self._files["metrics.jsonl"].write(json.dumps(record) + "\n")
-
-    def _switch_row(self, event: SwitchDecided) -> list[Any]:
-        decision = event.decision
-        switching = isinstance(decision, SwitchTo)
-        known: dict[str, Any] = {
-            "step": event.step,
-            "visit": event.visit,
-            "task": self._tasks[event.task],
-            "episodes_in_visit": event.episodes_in_visit,
-            "steps_in_visit": event.steps_in_visit,
-            "decision": "switch" if switching else "stay",
-            "next_task": self._tasks[decision.task] if isinstance(decision, SwitchTo) else "",
-            "reason": decision.reason,
-        }
-        numbers = {name: f"{value:.9g}" for name, value in decision.measured.items() if name not in known}
-        return [{**known, **numbers}.get(column, "") for column in SWITCH_COLUMNS]
-
-    def _row(self, name: str, values: Iterable[Any]) -> None:
-        self._files[name].write(",".join(str(value) for value in values) + "\n")
-
-    def sync(self) -> dict[str, int]:
-        """Bring everything to the disk; returns the size of each file."""
-        sizes = {}
-        for name, stream in self._files.items():
-            stream.flush()
-            os.fsync(stream.fileno())
-            sizes[name] = stream.tell()
-        return sizes
-
-    def close(self) -> None:
-        """Close the files."""
-        for stream in self._files.values():
-            stream.close()
-
-
-def describe_environment(config: ExperimentConfig, device: torch.device) -> dict[str, Any]:
-    """Facts that a reader of the run's numbers needs: versions, machine, device, files of the suite, command."""
-    suite = suite_of(config.tasks)
-    suites = (*SUITES.values(), type(suite))
-    versions: dict[str, str | None] = {}
-    for package in dict.fromkeys((*_PACKAGES, *(package for each in suites for package in each.packages))):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
-    return {
-        "program": "switchmt-snn",
-        "command": command_line(),
-        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": processor(),
-        "cores": os.cpu_count(),
-        "torch_threads": torch.get_num_threads(),
-        "device": str(device),
-        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
-        "versions": versions,
-        "files_sha256": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in suite.files.items()},
-    }
-
-
 def _evaluation_stem(step: int) -> str:
     return f"step-{step:012d}"
-
-
-def command_line() -> str:
-    """The command line without the folder in which the program lies; ``python`` for a library call."""
-    program = Path(sys.argv[0]).name
-    ours = program in ("switchmt-snn", "__main__.py")
-    return shlex.join(["switchmt-snn", *sys.argv[1:]]) if ours else f"python {program}"
-
-
-def processor() -> str:
-    """The processor's name, as the system tells it."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor()
 
 
 def _unwritable(path: Path, error: OSError) -> str:

@@ -9,6 +9,7 @@ import torch
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.switching import make_criterion
 from switchmt_snn.machine.devices import select_device
 from switchmt_snn.machine.memory import GIB, available_bytes
 from switchmt_snn.replay.size import compresses_replay, plain_frame_bytes
@@ -54,7 +55,7 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
     elif compresses_replay(config, suite):
         frames = int(min(frames / COMPRESSION, config.learning.replay_max_gib * GIB))
     parameters = trainable_parameters(network) * 4
-    snapshots = config.switching.window_episodes + 2 if config.switching.policy.startswith("parameter") else 0
+    snapshots = make_criterion(config.switching).snapshots(config.switching)
     # A training step keeps currents, membranes, spikes and the surrogate's terms of T steps, the inputs as floats
     # besides. Peak memory at batch 64 and 256 on the 84x84 network, before the
     # surrogate's backward worked in place (which takes less): 7.1 floats per neuron and step.

@@ -17,21 +17,18 @@ import torch
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.config import ExperimentConfig, from_dict, load_config, resolve, to_dict
+from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.shared_learner import SharedLearner
+from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.description import describe_method
-from switchmt_snn.runs.folder import (
-    RunFolder,
-    RunLogs,
-    check_same_config,
-    describe_environment,
-    latest_run,
-    new_run_path,
-)
+from switchmt_snn.runs.environment import describe_environment
+from switchmt_snn.runs.folder import RunFolder, check_same_config, latest_run, new_run_path
+from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.memory import require_gpu_memory, require_memory
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite
@@ -78,6 +75,7 @@ def train(
     config: ExperimentConfig | str | Path | None = None,
     run: str | Path | None = None,
     observers: Sequence[Observer] = (),
+    policy: type[Criterion] | None = None,
 ) -> RunResult:
     """Train, or continue a run.
 
@@ -86,6 +84,8 @@ def train(
             quickstart preset for a new run.
         run: run folder. One that holds a run of the same config is continued; None makes a new one under ``runs/``.
         observers: progress displays and the like.
+        policy: a switching criterion of your own in place of the config's. The run stores its name, so that it can be
+            continued (docs/extending.md, Switching policy).
 
     Under ``torchrun`` the first process does all this, and every update is divided among all processes.
 
@@ -94,7 +94,9 @@ def train(
     """
     group = join_processes()
     try:
-        return _serve(group) if group is not None and group.rank > 0 else _train(config, run, observers, group)
+        if group is not None and group.rank > 0:
+            return _serve(group)
+        return _train(config, run, observers, group, policy)
     finally:
         if group is not None:
             group.leave()
@@ -105,6 +107,7 @@ def _train(
     run: str | Path | None,
     observers: Sequence[Observer],
     group: ProcessGroup | None,
+    policy: type[Criterion] | None,
 ) -> RunResult:
     if isinstance(config, (str, Path)):
         config = load_config(config)
@@ -112,6 +115,9 @@ def _train(
     stored = folder.config() if folder.is_run else None
     if config is None:
         config = stored or load_config("quickstart")
+    if policy is not None:
+        switching = replace(config.switching, policy=plugin_name(policy, "policy"))
+        config = replace(config, switching=switching)
     device = select_device(config.device) if group is None else group.device(config.device)
     processes = 1 if group is None else group.size
     config, notes = settle(resolve(config), stored, device, processes)
@@ -188,7 +194,7 @@ class _Driver:
 
     def _run(self, log_sizes: dict[str, int] | None, resumed_at: int | None, notes: list[str]) -> RunResult:
         training, path = self.training, self.folder.path
-        self.logs = logs = RunLogs(self.folder, training.suite.names, log_sizes)
+        self.logs = logs = RunLogs(path, training.suite.names, training.policy.columns, log_sizes)
         for observer in self.observers:
             observer.start(training, self.folder, resumed_at)
         for text in notes:

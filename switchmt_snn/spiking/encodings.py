@@ -36,6 +36,11 @@ class Encoder:
                 f"network.encoding is {config.encoding!r}, expected direct, frames or events for vector observations; "
                 "rate and latency need values in [0, 1]"
             )
+        if config.encoding in ("frames", "events") and config.timesteps != frame_stack:
+            raise ConfigError(
+                f"network.timesteps is {config.timesteps!r}, expected tasks.frame_stack ({frame_stack}) for "
+                f"encoding={config.encoding}, one stacked frame per step"
+            )
         self.encoding = config.encoding
         self.timesteps = config.timesteps
         self.frame_stack = frame_stack

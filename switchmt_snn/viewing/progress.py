@@ -160,17 +160,10 @@ def _mean(values: deque[float]) -> str:
 
 
 def _distance(event: SwitchDecided) -> str:
-    """How far the last decision was from a switch, in the policy's own numbers."""
-    decision, measured = event.decision, event.decision.measured
+    """How near the last decision was to a switch: the criterion's summary, else its reason and its numbers."""
+    decision = event.decision
     if isinstance(decision, SwitchTo):
         return f"came by {decision.reason}"
-    pairs = (
-        ("parameter_change", "change_threshold", "change {:.1%} of {:.1%}"),
-        ("episodes_in_visit", "visit_episodes", "episode {:.0f} of {:.0f}"),
-        ("steps_in_visit", "visit_steps", "step {:.0f} of {:.0f}"),
-        ("reward_t", "plateau_t", "return slope {:.2f} of {:.2f} s.e."),
-    )
-    for seen, limit, text in pairs:
-        if seen in measured and limit in measured:
-            return text.format(measured[seen], measured[limit])
-    return decision.reason.replace("_", " ")
+    numbers = ", ".join(f"{name} {value:.4g}" for name, value in decision.measured.items())
+    reason = decision.reason.replace("_", " ")
+    return decision.summary or (f"{reason} ({numbers})" if numbers else reason)

@@ -43,7 +43,6 @@ PRESETS = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
         ({"tasks": {"names": ["pong", "pong"]}}, "expected every task once"),
         ({"network": {"method": "SwitchMTT"}}, "did you mean 'SwitchMT'"),
         ({"network": {"timesteps": 0}}, "network.timesteps is 0, expected at least 1"),
-        ({"network": {"encoding": "frames", "timesteps": 3}}, r"expected tasks.frame_stack \(4\)"),
         ({"network": {"method": "DQN", "encoding": "rate"}}, "expected direct for the ANN method DQN"),
         ({"network": {"method": "DSQN", "dendrites": "shared"}}, "expected none for method DSQN"),
         ({"learning": {"batch_size": 100, "replay_capacity_steps": 50}}, "lower the batch or raise the capacity"),

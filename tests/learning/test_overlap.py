@@ -1,4 +1,4 @@
-"""Environments that step beside the update: bitwise the loop without a second thread."""
+"""Environments that step while an update runs: bitwise the loop without a second thread."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from switchmt_snn.tasks.registry import make_suite
 class Lazily:
     """A step that runs when its result is asked for, which is after the update, on the same thread."""
 
-    def __init__(self, step: Any, actions: Any) -> None:
-        self.result = lambda: step(actions)
+    def __init__(self, play: Any, actions: Any) -> None:
+        self.result = lambda: play.step(actions)
 
 
-def immediately(step: Any, actions: Any) -> Future[Any]:
+def immediately(play: Any, actions: Any) -> Future[Any]:
     """A step that has run before the update begins, on the same thread."""
     done: Future[Any] = Future()
-    done.set_result(step(actions))
+    done.set_result(play.step(actions))
     return done
 
 
@@ -58,8 +58,8 @@ def training(overlap: bool) -> Training:
 
 def test_the_other_thread_changes_nothing_at_any_step(monkeypatch: pytest.MonkeyPatch) -> None:
     trainings = [training(overlap=True) for _ in range(3)]
-    monkeypatch.setattr(trainings[1], "_beside", immediately)
-    monkeypatch.setattr(trainings[2], "_beside", Lazily)
+    monkeypatch.setattr(trainings[1], "_step_on_thread", immediately)
+    monkeypatch.setattr(trainings[2], "_step_on_thread", Lazily)
     steps = 0
     for events in zip(*(each.events() for each in trainings), strict=True):
         assert events[0] == events[1] == events[2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -15,13 +16,18 @@ from switchmt_snn.config import POLICIES, SwitchingConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.switching import (
+    CRITERIA,
+    DECISION_COLUMNS,
+    Criterion,
     EpisodeRecord,
     Stay,
     SwitchingPolicy,
     SwitchTo,
-    relative_change,
-    slope_test,
+    Verdict,
+    register_criterion,
 )
+from switchmt_snn.learning.switching.parameter_change import relative_change
+from switchmt_snn.learning.switching.reward_plateau import slope_test
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite
 
 
@@ -46,7 +52,7 @@ def play(policy: SwitchingPolicy, lengths: list[int], drift: float, values: list
 
 @settings(max_examples=80, deadline=None)
 @given(
-    policy=st.sampled_from(POLICIES),
+    policy=st.sampled_from(sorted(CRITERIA)),
     lengths=st.lists(st.integers(1, 60), min_size=1, max_size=80),
     drift=st.floats(0.0, 0.2),
     seed=st.integers(0, 1000),
@@ -54,7 +60,7 @@ def play(policy: SwitchingPolicy, lengths: list[int], drift: float, values: list
     extra=st.integers(1, 300),
     min_episodes=st.integers(0, 10),
 )
-def test_bounds_and_determinism(policy, lengths, drift, seed, min_steps, extra, min_episodes) -> None:
+def test_every_criterion_keeps_the_bounds(policy, lengths, drift, seed, min_steps, extra, min_episodes) -> None:
     """Never leaves before min_stay, always at the first episode end past max_stay; same records, same decisions."""
     config = SwitchingConfig(
         policy=policy,
@@ -78,8 +84,8 @@ def test_bounds_and_determinism(policy, lengths, drift, seed, min_steps, extra, 
             assert left
 
 
-def test_every_policy_can_leave_and_one_task_never_does() -> None:
-    for name in POLICIES:
+def test_every_criterion_can_leave_and_with_one_task_none_does() -> None:
+    for name in CRITERIA:
         config = SwitchingConfig(
             policy=name,
             visit_episodes=3,
@@ -155,6 +161,153 @@ def test_reward_plateau_needs_patience() -> None:
     left = next(index for index, d in enumerate(flat) if isinstance(d, SwitchTo))
     assert flat[left].measured["flat_episodes"] == 3
     assert [d.measured["flat_episodes"] for d in flat[left - 2 : left]] == [1, 2]
+
+
+def test_the_config_names_every_criterion_and_no_other() -> None:
+    assert set(CRITERIA) == set(POLICIES)
+
+
+@pytest.mark.parametrize("name", sorted(CRITERIA))
+def test_every_criterion_reports_its_columns_and_keeps_no_more_snapshots_than_it_declares(name: str) -> None:
+    config = SwitchingConfig(policy=name, window_episodes=2, plateau_window_episodes=4)
+    policy = SwitchingPolicy(config, 3)
+    seen: set[str] = set()
+    alive: list[weakref.ref[Tensor]] = []
+    most = 0
+
+    def parameters() -> Tensor:
+        nonlocal most
+        theta = torch.rand(4)
+        alive.append(weakref.ref(theta))
+        most = max(most, sum(reference() is not None for reference in alive))
+        return theta
+
+    for episode in range(1, 20):
+        updates = 0 if episode < 5 else 10 * episode
+        decision = policy.end_of_episode(EpisodeRecord(0, 1, 1, updates, float(episode), parameters))
+        seen |= set(decision.measured)
+    assert seen == set(policy.columns)
+    assert most <= policy.criterion.snapshots(config)
+    assert not seen & set(DECISION_COLUMNS)
+
+
+class ReturnAbove(Criterion):
+    """Leaves when the mean return of the visit is above a bound."""
+
+    columns = ("mean_return",)
+    SAVED = ("returns",)
+    DERIVED = ("bound",)
+
+    def __init__(self, config: SwitchingConfig, bound: float = 1.0) -> None:
+        self.bound = bound
+        self.returns: list[float] = []
+
+    def start_visit(self) -> None:
+        self.returns = []
+
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        self.returns.append(record.episode_return)
+        mean = sum(self.returns) / len(self.returns)
+        return Verdict(mean > self.bound, "return_above", {"mean_return": mean})
+
+
+class UndeclaredNumber(ReturnAbove):
+    columns = ()
+
+
+class UndeclaredSnapshot(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return Verdict(False, "never", {"mean_return": float(record.parameters().sum())})
+
+
+class LostAttribute(ReturnAbove):
+    SAVED = ()
+
+
+class LateAttribute(ReturnAbove):
+    def start_visit(self) -> None:
+        self.visits = 1
+        super().start_visit()
+
+
+class NoColumns(Criterion):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return Verdict(False, "never", {})
+
+
+class NoRule(Criterion):
+    columns = ()
+
+
+class TextAsColumns(ReturnAbove):
+    columns = "mean_return"  # type: ignore[assignment]
+
+
+class TakenColumn(ReturnAbove):
+    columns = ("step",)
+
+
+class NoCriterion:
+    columns = ()
+
+
+def own(criterion: type, **changes: object) -> SwitchingPolicy:
+    return SwitchingPolicy(SwitchingConfig(policy=f"{__name__}:{criterion.__name__}", **changes), 2)  # type: ignore[arg-type]
+
+
+def test_a_criterion_from_outside_decides_with_its_options() -> None:
+    for options, leaves in (((), True), (("bound=5",), False), (("bound=1e0",), True)):
+        policy = own(ReturnAbove, options=options)
+        assert policy.columns == ("mean_return",)
+        decision = policy.end_of_episode(record(1, 1, torch.ones(1), value=3.0))
+        assert isinstance(decision, SwitchTo) == leaves
+        assert decision.measured == {"mean_return": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("criterion", "complaint"),
+    [
+        (NoCriterion, "is no criterion, expected a subclass of switchmt_snn.learning.switching.Criterion"),
+        (NoRule, "defines no end_of_episode"),
+        (NoColumns, "columns are None, expected a tuple"),
+        (TextAsColumns, "columns are 'mean_return', expected a tuple"),
+        (TakenColumn, "has a column 'step', expected plain names"),
+        (LostAttribute, "LostAttribute has the attribute 'returns', expected it in SAVED"),
+    ],
+)
+def test_a_class_that_is_no_whole_criterion_is_refused_in_one_line(criterion: type, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        own(criterion)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_a_criterion_does_not_declare_is_refused_when_it_shows() -> None:
+    with pytest.raises(ConfigError, match=r"criterion UndeclaredNumber measured 'mean_return', expected .* \(none\)"):
+        own(UndeclaredNumber).end_of_episode(record(1, 1, torch.ones(1)))
+    with pytest.raises(ConfigError, match="UndeclaredSnapshot asks for the parameters but declares 0 snapshots"):
+        own(UndeclaredSnapshot).end_of_episode(record(1, 1, torch.ones(1)))
+    policy = own(LateAttribute)
+    policy.state_dict()
+    policy.end_of_episode(record(1, 1, torch.ones(1), value=3.0))
+    with pytest.raises(ConfigError, match="LateAttribute has the attribute 'visits'"):
+        policy.state_dict()
+
+
+def test_wrong_options_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"switching.options has 'bund', expected .* did you mean 'bound'"):
+        own(ReturnAbove, options=("bund=1",))
+    for option in ("bound", "=1", "bound=[1]", "two words=1"):
+        with pytest.raises(ConfigError, match="expected name=value"):
+            own(ReturnAbove, options=(option,))
+    with pytest.raises(ConfigError, match="expected none for policy interleave"):
+        SwitchingConfig(policy="interleave", options=("bound=1",))
+
+
+def test_a_registered_name_is_one_that_the_config_takes_and_that_is_free() -> None:
+    with pytest.raises(ConfigError, match="'return_above' is not a value"):
+        register_criterion("return_above")(ReturnAbove)
+    with pytest.raises(ConfigError, match="'interleave' is Interleave, expected a name that is free"):
+        register_criterion("interleave")(ReturnAbove)
 
 
 def test_unresolved_policy_is_refused() -> None:

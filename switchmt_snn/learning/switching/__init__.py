@@ -1,0 +1,61 @@
+"""Switching policies: at each episode end, stay on the task or go to the next one (paper, section 3.2.2, Algorithm 1).
+
+A policy is a criterion (has learning on this task levelled off?) within bounds that all policies share (``bounds.py``).
+One file per criterion:
+
+=============================  ==================================================  =================================
+name                           leaves when                                         file
+=============================  ==================================================  =================================
+fixed_episodes                 a number of episodes ended                          fixed_episodes.py
+fixed_steps                    a number of steps passed                            fixed_steps.py
+interleave                     any episode ended                                   interleave.py
+parameter_change               Eq. 3 is below a threshold                          parameter_change.py
+parameter_change_per_update    Eq. 3 per gradient step fell to a fraction          parameter_change_per_update.py
+reward_plateau                 the returns no longer rise                          reward_plateau.py
+parameter_and_reward           parameter_change and reward_plateau both leave      parameter_and_reward.py
+=============================  ==================================================  =================================
+
+A class from outside the package is named ``package.module:Class`` (docs/extending.md, Switching policy).
+"""
+
+from switchmt_snn.learning.switching import (
+    fixed_episodes,
+    fixed_steps,
+    interleave,
+    parameter_and_reward,
+    parameter_change,
+    parameter_change_per_update,
+    reward_plateau,
+)
+from switchmt_snn.learning.switching.bounds import Stay, SwitchingPolicy, SwitchTo
+from switchmt_snn.learning.switching.criterion import (
+    CRITERIA,
+    DECISION_COLUMNS,
+    Criterion,
+    EpisodeRecord,
+    Verdict,
+    criterion_class,
+    make_criterion,
+    register_criterion,
+)
+
+__all__ = [
+    "CRITERIA",
+    "DECISION_COLUMNS",
+    "Criterion",
+    "EpisodeRecord",
+    "Stay",
+    "SwitchTo",
+    "SwitchingPolicy",
+    "Verdict",
+    "criterion_class",
+    "fixed_episodes",
+    "fixed_steps",
+    "interleave",
+    "make_criterion",
+    "parameter_and_reward",
+    "parameter_change",
+    "parameter_change_per_update",
+    "register_criterion",
+    "reward_plateau",
+]

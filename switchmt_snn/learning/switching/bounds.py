@@ -1,0 +1,121 @@
+"""The switching policy: a criterion within the bounds that all policies keep (``min_stay_*``, ``max_stay_steps``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from switchmt_snn.config import SwitchingConfig
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.state import Stateful
+from switchmt_snn.learning.switching.criterion import EpisodeRecord, Verdict, check_state, make_criterion
+
+
+@dataclass(frozen=True)
+class Stay:
+    """Stay on the task; the rest as in :class:`Verdict`."""
+
+    reason: str
+    measured: dict[str, float]
+    summary: str = ""
+
+
+@dataclass(frozen=True)
+class SwitchTo:
+    """Leave for another task; the rest as in :class:`Verdict`."""
+
+    task: int
+    reason: str
+    measured: dict[str, float]
+
+
+class SwitchingPolicy(Stateful):
+    """A criterion within bounds: never leaves before the minimal stay, always by the maximal one.
+
+    The next task is always ``(i + 1) mod |E|``.
+    """
+
+    SAVED = ("criterion",)
+    DERIVED = ("config", "num_tasks")
+
+    def __init__(self, config: SwitchingConfig, num_tasks: int) -> None:
+        """Make the criterion that the config names.
+
+        Raises:
+            ConfigError: the policy is not resolved, unknown, or no criterion (:func:`make_criterion`).
+        """
+        self.config = config
+        self.num_tasks = num_tasks
+        self.criterion = make_criterion(config)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the numbers that its decisions report."""
+        return self.criterion.columns
+
+    def end_of_episode(self, record: EpisodeRecord) -> Stay | SwitchTo:
+        """Decide at an episode's end.
+
+        Raises:
+            ConfigError: the criterion reports a number that it does not declare in ``columns``, or asks for parameters
+                although it declares no ``snapshots``.
+        """
+        if self.criterion.snapshots(self.config) == 0:
+            record = replace(record, parameters=self._undeclared_snapshot)
+        verdict = self.criterion.end_of_episode(record)
+        measured = self._checked(verdict)
+        if self.must_leave(record.steps_in_visit):
+            return self._next(record.task, "max_stay_steps", measured)
+        if not verdict.leave:
+            return Stay(verdict.reason, measured, verdict.summary)
+        if self.num_tasks == 1:
+            return Stay("only_task", measured, verdict.summary)
+        too_soon = (
+            record.steps_in_visit < self.config.min_stay_steps
+            or record.episodes_in_visit < self.config.min_stay_episodes
+        )
+        if too_soon:
+            return Stay("min_stay", measured, verdict.summary)
+        return self._next(record.task, verdict.reason, measured)
+
+    def must_leave(self, steps_in_visit: int) -> bool:
+        """Whether the visit has lasted ``max_stay_steps``; asked at every step, also within an episode."""
+        limit = self.config.max_stay_steps
+        return limit is not None and self.num_tasks > 1 and steps_in_visit >= limit
+
+    def leave(self, task: int) -> SwitchTo:
+        """The switch that :meth:`must_leave` demands within an episode."""
+        return self._next(task, "max_stay_steps", {})
+
+    def state_dict(self) -> dict[str, Any]:
+        """The criterion's state.
+
+        Raises:
+            ConfigError: the criterion has an attribute that a resume would lose.
+        """
+        check_state(self.criterion)
+        return super().state_dict()
+
+    def _next(self, task: int, reason: str, measured: dict[str, float]) -> SwitchTo:
+        """i <- (i + 1) mod |E|, H_i <- []."""
+        self.criterion.start_visit()
+        return SwitchTo((task + 1) % self.num_tasks, reason, measured)
+
+    def _checked(self, verdict: Verdict) -> dict[str, float]:
+        """The measured numbers, each of which has a column."""
+        for name in verdict.measured:
+            if name not in self.columns:
+                raise ConfigError(
+                    f"criterion {type(self.criterion).__name__} measured {name!r}, expected one of its columns "
+                    f"({', '.join(self.columns) or 'none'}); add {name!r} to {type(self.criterion).__name__}.columns"
+                )
+        return {name: float(value) for name, value in verdict.measured.items()}
+
+    def _undeclared_snapshot(self) -> Tensor:
+        name = type(self.criterion).__name__
+        raise ConfigError(
+            f"criterion {name} asks for the parameters but declares 0 snapshots, expected at least 1; define "
+            f"{name}.snapshots(config), so that the memory estimate counts them"
+        )

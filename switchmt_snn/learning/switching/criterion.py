@@ -1,0 +1,205 @@
+"""What a switching criterion is, and the registry of criteria.
+
+A criterion is one subclass of :class:`Criterion` in one file. The class itself states what other parts of the package
+must know: the columns of switches.csv, the memory it takes, the line on the screen.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+from torch import Tensor
+
+from switchmt_snn.config import POLICIES, SwitchingConfig
+from switchmt_snn.config.plugins import is_plugin, load_plugin, plugin_options
+from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.learning.state import Stateful
+
+DECISION_COLUMNS = (
+    "step",
+    "visit",
+    "task",
+    "episodes_in_visit",
+    "steps_in_visit",
+    "decision",
+    "next_task",
+    "reason",
+)
+"""The columns of switches.csv that every run has; a criterion's own columns follow."""
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """What a criterion may look at when an episode ends.
+
+    Attributes:
+        task: index of the task.
+        episodes_in_visit: episodes that ended since the task was entered, this one included.
+        steps_in_visit: agent steps since the task was entered.
+        updates: gradient steps of the whole run.
+        episode_return: raw return of the episode.
+        parameters: returns theta_t as a vector, a copy that stays as it is. Only a criterion that declares
+            :meth:`Criterion.snapshots` may call it.
+    """
+
+    task: int
+    episodes_in_visit: int
+    steps_in_visit: int
+    updates: int
+    episode_return: float
+    parameters: Callable[[], Tensor]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A criterion's answer.
+
+    Attributes:
+        leave: whether learning has levelled off.
+        reason: a short name for what decided; a column of switches.csv.
+        measured: every number that the answer rests on, by its name in :attr:`Criterion.columns`.
+        summary: how near the task is to a switch, in a few words for the progress display.
+    """
+
+    leave: bool
+    reason: str
+    measured: dict[str, float]
+    summary: str = ""
+
+
+class Criterion(Stateful):
+    """Decides at each episode's end whether learning on the current task has levelled off.
+
+    A subclass defines :attr:`columns`, its constructor and :meth:`end_of_episode`. ``switching.options`` sets keyword
+    arguments of its constructor; give each a default. Attributes that change are named in ``SAVED`` and the others in
+    ``DERIVED``, so that a run resumes exactly.
+
+    Attributes:
+        columns: names of the numbers that it reports in :attr:`Verdict.measured`; they are columns of switches.csv.
+    """
+
+    columns: ClassVar[tuple[str, ...]]
+
+    def __init__(self, config: SwitchingConfig) -> None:
+        """Take what it needs of the settings in section ``switching``."""
+
+    @classmethod
+    def snapshots(cls, config: SwitchingConfig) -> int:
+        """The largest number of parameter vectors that it holds at a time, for the memory estimate. Default: 0."""
+        return 0
+
+    def start_visit(self) -> None:
+        """Forget the last visit (Algorithm 1: H_i <- []). Default: nothing to forget."""
+
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        """Take an episode in, and judge."""
+        raise NotImplementedError(f"{type(self).__name__} defines no end_of_episode, expected its rule")
+
+
+CRITERIA: dict[str, type[Criterion]] = {}
+"""The criteria of this package, by the name that ``switching.policy`` takes."""
+
+_C = TypeVar("_C", bound=type[Criterion])
+
+
+def register_criterion(name: str) -> Callable[[_C], _C]:
+    """Class decorator: makes a criterion of this package known by a name.
+
+    Raises:
+        ConfigError: the config does not take the name, the name is taken, or the class is no criterion.
+    """
+
+    def register(criterion: _C) -> _C:
+        if name not in POLICIES:
+            raise ConfigError(
+                f"criterion {name!r} is not a value of switching.policy, expected one of {', '.join(POLICIES)}; add it "
+                "to Policy in switchmt_snn/config/experiment.py, or use package.module:Class"
+            )
+        if CRITERIA.get(name, criterion) is not criterion:
+            raise ConfigError(f"criterion {name!r} is {CRITERIA[name].__name__}, expected a name that is free")
+        CRITERIA[name] = check_criterion(criterion, name)
+        return criterion
+
+    return register
+
+
+def criterion_class(policy: str) -> type[Criterion]:
+    """The class that a resolved ``switching.policy`` names: of this package, or ``package.module:Class``.
+
+    Raises:
+        ConfigError: the policy is unknown, cannot be imported, or is no criterion.
+    """
+    if policy in CRITERIA:
+        return CRITERIA[policy]
+    if is_plugin(policy):
+        return check_criterion(load_plugin(policy, "switching.policy"), policy)
+    raise ConfigError(
+        f"switching.policy is {policy!r}, expected one of {', '.join(CRITERIA)}, or package.module:Class"
+        f"{did_you_mean(policy, CRITERIA)}"
+    )
+
+
+def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
+    """Return the class if it is a whole criterion.
+
+    Raises:
+        ConfigError: it is no subclass of :class:`Criterion`, or lacks :attr:`Criterion.columns` or
+            :meth:`Criterion.end_of_episode`, or a column bears a name of :data:`DECISION_COLUMNS`.
+    """
+    seen = f"switching.policy is {policy!r}"
+    if not (isinstance(criterion, type) and issubclass(criterion, Criterion)):
+        raise ConfigError(
+            f"{seen}, which is no criterion, expected a subclass of switchmt_snn.learning.switching.Criterion"
+        )
+    if criterion.end_of_episode is Criterion.end_of_episode:
+        raise ConfigError(f"{seen}, which defines no end_of_episode, expected end_of_episode(self, record) -> Verdict")
+    columns = getattr(criterion, "columns", None)
+    if not (isinstance(columns, tuple) and all(isinstance(column, str) for column in columns)):
+        raise ConfigError(
+            f"{seen}, whose columns are {columns!r}, expected a tuple with the names of the numbers that it measures; "
+            "() if it measures none"
+        )
+    for column in columns:
+        if column in DECISION_COLUMNS or not column.isidentifier() or columns.count(column) > 1:
+            raise ConfigError(
+                f"{seen}, which has a column {column!r}, expected plain names, each once, and none of "
+                f"{', '.join(DECISION_COLUMNS)}"
+            )
+    return criterion
+
+
+def make_criterion(config: SwitchingConfig) -> Criterion:
+    """The criterion of a resolved config, with its options.
+
+    Raises:
+        ConfigError: an unknown policy, an option that the class does not take, or state that a resume would lose.
+    """
+    cls = criterion_class(config.policy)
+    options = plugin_options(config.options, "switching.options")
+    known = list(inspect.signature(cls).parameters)[1:]
+    for name in options:
+        if name not in known:
+            raise ConfigError(
+                f"switching.options has {name!r}, expected keyword arguments of {cls.__name__}"
+                f"{did_you_mean(name, known) if known else ' (it has none)'}"
+            )
+    criterion = cls(config, **options)
+    check_state(criterion)
+    return criterion
+
+
+def check_state(criterion: Criterion) -> None:
+    """Refuse a criterion with an attribute that a resume would lose.
+
+    Raises:
+        ConfigError: naming the attribute.
+    """
+    for name in vars(criterion):
+        if name not in (*criterion.SAVED, *criterion.DERIVED):
+            raise ConfigError(
+                f"{type(criterion).__name__} has the attribute {name!r}, expected it in SAVED (what changes) or "
+                "DERIVED (what the constructor sets); else a resumed run would lose it"
+            )

@@ -1,0 +1,65 @@
+"""What a reader of a run's numbers must know of the machine: versions, processor, device, files, command."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.tasks.registry import SUITES, suite_of
+
+_PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "safetensors", "zstandard")
+"""Distributions whose versions a run stores, with those that suites name."""
+
+
+def describe_environment(config: ExperimentConfig, device: torch.device) -> dict[str, Any]:
+    """Facts that a reader of the run's numbers needs: versions, machine, device, files of the suite, command."""
+    suite = suite_of(config.tasks)
+    suites = (*SUITES.values(), type(suite))
+    versions: dict[str, str | None] = {}
+    for package in dict.fromkeys((*_PACKAGES, *(package for each in suites for package in each.packages))):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return {
+        "program": "switchmt-snn",
+        "command": command_line(),
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "torch_threads": torch.get_num_threads(),
+        "device": str(device),
+        "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
+        "versions": versions,
+        "files_sha256": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in suite.files.items()},
+    }
+
+
+def command_line() -> str:
+    """The command line without the folder in which the program lies; ``python`` for a library call."""
+    program = Path(sys.argv[0]).name
+    ours = program in ("switchmt-snn", "__main__.py")
+    return shlex.join(["switchmt-snn", *sys.argv[1:]]) if ours else f"python {program}"
+
+
+def processor() -> str:
+    """The processor's name, as the system tells it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor()
