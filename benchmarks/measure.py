@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from switchmt_snn.native.products import Panels
+from switchmt_snn.native.panels import Panels
 from switchmt_snn.runs.environment import processor
 
 PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "ale-py", "zstandard", "onnxruntime")

@@ -1,4 +1,7 @@
-"""Adam for native updates: PyTorch's formula and state, in one pass over memory that also writes what products read."""
+"""Adam for native updates (``csrc/adam.cpp``): PyTorch's formula and state.
+
+One pass over memory, which also writes the copies of weights that products read.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ from switchmt_snn.native.network import NativeNetwork
 
 
 class _Tensor(ctypes.Structure):
+    """``struct Tensor`` of ``csrc/adam.cpp``."""
+
     _fields_ = (
         ("parameter", ctypes.c_void_p),
         ("mean", ctypes.c_void_p),
@@ -22,9 +27,9 @@ class _Tensor(ctypes.Structure):
         ("step", ctypes.c_void_p),
         ("copy", ctypes.c_void_p),
         ("size", ctypes.c_long),
-        ("low", ctypes.c_long),
+        ("copy_is_bf16", ctypes.c_long),
         ("channels", ctypes.c_long),
-        ("places", ctypes.c_long),
+        ("positions", ctypes.c_long),
     )
 
 
@@ -40,7 +45,7 @@ class NativeAdam(torch.optim.Adam):
         self._network = network
         (group,) = self.param_groups
         self._tensors = (_Tensor * len(group["params"]))()
-        self._found: list[dict[str, Any] | None] = [None] * len(group["params"])
+        self._bound: list[dict[str, Any] | None] = [None] * len(group["params"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a state of this class or of :class:`torch.optim.Adam`.
@@ -62,46 +67,47 @@ class NativeAdam(torch.optim.Adam):
         """One step; parameters without gradient stay.
 
         Raises:
-            ValueError: there is a closure.
+            ValueError: a closure was given.
         """
         if closure is not None:
             raise ValueError("a closure, expected none: gradients are computed before a step")
         (group,) = self.param_groups
-        were_true, held, moved = self._network.copies_are_true(), [], []  # held: what is pointed to must live
+        copies_were_current = self._network.copies_are_current()
+        gradients, moved = [], []  # gradients must live until C++ returns
         for index, (tensor, parameter) in enumerate(zip(self._tensors, group["params"], strict=True)):
             tensor.gradient = None
             if parameter.grad is None:
                 continue
             state = self.state[parameter]
-            if state is not self._found[index] or tensor.parameter != parameter.data_ptr():
-                self._find(index, parameter, state)
+            if state is not self._bound[index] or tensor.parameter != parameter.data_ptr():
+                self._bind_pointers(index, parameter, state)
             gradient = _laid_out_like(parameter, parameter.grad)
             tensor.gradient = gradient.data_ptr()
-            held.append(gradient)
+            gradients.append(gradient)
             moved.append(parameter)
-        numbers = (group["lr"], *group["betas"], group["eps"])
-        library().snn_adam(ctypes.addressof(self._tensors), len(self._tensors), *numbers, torch.get_num_threads())
+        settings = (group["lr"], *group["betas"], group["eps"])
+        library().snn_adam(ctypes.addressof(self._tensors), len(self._tensors), *settings, torch.get_num_threads())
         torch.autograd.graph.increment_version(moved)
-        if were_true:
-            self._network.note_true_copies()
+        if copies_were_current:
+            self._network.mark_copies_current()
 
     step.hooked = True  # type: ignore[attr-defined]  # else PyTorch wraps it, for hooks and profilers
 
-    def _find(self, index: int, parameter: Tensor, state: dict[str, Any]) -> None:
-        """Where a parameter, its state and its copy lie; they stay there until the state is another one."""
+    def _bind_pointers(self, index: int, parameter: Tensor, state: dict[str, Any]) -> None:
+        """Take pointers to a parameter, its state and its copy; they stay valid until the state is replaced."""
         if not state:
             state["step"] = torch.zeros(())
             state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
             state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-        self._found[index], tensor = state, self._tensors[index]
+        self._bound[index], tensor = state, self._tensors[index]
         tensor.parameter, tensor.size = parameter.data_ptr(), parameter.numel()
-        places = [state[name].data_ptr() for name in ("exp_avg", "exp_avg_sq", "step")]
-        tensor.mean, tensor.square, tensor.step = places
-        tensor.places = 1
+        moments = [state[name].data_ptr() for name in ("exp_avg", "exp_avg_sq", "step")]
+        tensor.mean, tensor.square, tensor.step = moments
+        tensor.positions = 1
         if (copy := self._network.copies.get(parameter)) is not None:
-            tensor.copy, tensor.low = copy.data_ptr(), copy.dtype == torch.bfloat16
+            tensor.copy, tensor.copy_is_bf16 = copy.data_ptr(), copy.dtype == torch.bfloat16
             if copy.stride() != parameter.stride():  # images with channels innermost
-                tensor.channels, tensor.places = parameter.shape[1], parameter[0, 0].numel()
+                tensor.channels, tensor.positions = parameter.shape[1], parameter[0, 0].numel()
 
 
 def _laid_out_like(parameter: Tensor, gradient: Tensor) -> Tensor:

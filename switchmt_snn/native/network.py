@@ -1,7 +1,8 @@
-"""A network's decision through the native neuron layers: the same function as :meth:`QNetwork.decide`.
+"""A network's decision in C++: the same function as :meth:`QNetwork.decide`, with its backward written by hand.
 
-Synaptic products are :mod:`switchmt_snn.native.products`', neurons :mod:`switchmt_snn.native.neurons`'s, and
-channels lie innermost. For autograd, all from the encoded inputs to the heads' outputs is one operation.
+Synaptic products are in :mod:`switchmt_snn.native.products`, neurons in :mod:`switchmt_snn.native.neurons`; channels
+are innermost in memory. For autograd, everything from the encoded inputs to the heads' outputs is one operation.
+``native/README.md`` draws both directions side by side.
 
 Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons
 of all streams, A actions.
@@ -23,28 +24,28 @@ from switchmt_snn.native.streams import Gains, Heads
 from switchmt_snn.native.supports import spikes_as_bits
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
-WayBack = Callable[[Tensor], list[Tensor]]
+Backward = Callable[[Tensor], list[Tensor]]
 """From the gradient of the heads' outputs to those of :attr:`NativeNetwork._differentiated`."""
 
 
-class TaskView(NamedTuple):
-    """What a task changes in a network, until its parameters change."""
+class TaskParameters(NamedTuple):
+    """What a task changes in a network; valid until the network's parameters change."""
 
     task: int
     gain_N: Tensor
-    """Of the dendrites of all streams, one after the other."""
+    """Gains of the dendrites of all streams, one stream after the other."""
     context: Context
 
 
 class NativeNetwork:
-    """Q-values of a network that is read at every call.
+    """Q-values of a network whose parameters are read at every call.
 
     With ``torch.bfloat16``, weights, synaptic products and the gradients of products and inputs are rounded to it, as
-    under autocast; biases and the gradients of weights are not, except in PyTorch's products. All else is float32.
-    Everything is on the CPU. A change of parameters through ``.data`` is not seen.
+    under autocast. Biases and the gradients of weights are not, except in PyTorch's products. Everything else is
+    float32, and everything is on the CPU. A change of parameters through ``.data`` is not seen.
 
     Attributes:
-        copies: what products read instead of parameters, by parameter; images have channels innermost.
+        copies: what products read instead of parameters, by parameter; those of images have channels innermost.
     """
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
@@ -53,10 +54,10 @@ class NativeNetwork:
         self._network = network
         self._parameters = list(network.parameters())
         self._dtype = torch.float32 if precision is None else precision
-        form: Form = "bits" if spikes_as_bits(self._dtype) else "numbers"
+        form: Form = "bits" if spikes_as_bits(self._dtype) else "dense"
         neurons = self._neurons = Neurons(network.config)
         self._is_mean = network.config.readout == "mean"
-        self._last_form: Form = "mean" if self._is_mean else "floats"
+        self._last_form: Form = "mean" if self._is_mean else "float32"
         self._trunk = {
             name: _Layer(cast(TrunkLayer, layer), self._dtype, neurons, form) for name, layer in network.trunk.items()
         }
@@ -70,7 +71,7 @@ class NativeNetwork:
         self._differentiated = (*of_trunk, *of_streams)
         self.copies = {part: copy for synapses in self._synapses for part, copy in synapses.copies.items()}
         self._copied_version = self._version = -1
-        self._by_task: dict[int, TaskView] = {}
+        self._by_task: dict[int, TaskParameters] = {}
         self._contexts: dict[int, Context] = {}
 
     def inputs(self, observation: Tensor, generator: torch.Generator) -> Tensor:
@@ -82,22 +83,22 @@ class NativeNetwork:
         x = network.encode(observation, generator).to(self._dtype)
         return x.movedim(2, -1).contiguous()
 
-    def copies_are_true(self) -> bool:
-        """Whether all :attr:`copies` are those of the parameters as they are now."""
+    def copies_are_current(self) -> bool:
+        """Whether all :attr:`copies` equal the parameters as they are now."""
         return self._version_now() == self._copied_version
 
-    def note_true_copies(self) -> None:
-        """Who changed parameters has changed their copies as well; else :meth:`view` makes them anew."""
+    def mark_copies_current(self) -> None:
+        """Call this after updating parameters *and* their copies; otherwise the next :meth:`for_task` copies anew."""
         self._copied_version = self._version_now()
 
     def _version_now(self) -> int:
         return sum(parameter._version for parameter in self._parameters)
 
-    def view(self, task: int) -> TaskView:
-        """The network as a task sees it, its parameters as they are now.
+    def for_task(self, task: int) -> TaskParameters:
+        """What :meth:`decide` needs for a task, from the parameters as they are now.
 
         Raises:
-            IndexError: there is no such task.
+            IndexError: unknown task.
         """
         version = self._version_now()
         if version != self._version:
@@ -111,60 +112,79 @@ class NativeNetwork:
             gain_N = self._gains.of_task(task)
             if task not in self._contexts:
                 self._contexts[task] = self._network.context(task)  # views, which see changes
-            self._by_task[task] = TaskView(task, gain_N, self._contexts[task])
+            self._by_task[task] = TaskParameters(task, gain_N, self._contexts[task])
         return self._by_task[task]
 
-    def decide(self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor] = ()) -> list[Tensor]:
-        """Q-values ``[B, A]`` of :meth:`inputs`, normalised as ``training`` says; and after them those of other inputs,
-        normalised by the running statistics. Only the first ones of training have a gradient."""
+    def decide(
+        self, x: Tensor, parameters: TaskParameters, training: bool, other_inputs: Sequence[Tensor] = ()
+    ) -> list[Tensor]:
+        """Q-values ``[B, A]`` of several inputs at once, which shares products with the streams' weights.
+
+        Args:
+            x: of :meth:`inputs`; normalized by the batch if ``training``, and then its Q-values have a gradient.
+            parameters: of :meth:`for_task`.
+            training: see ``x``.
+            other_inputs: of :meth:`inputs`; normalized by the running statistics, their Q-values have no gradient.
+        """
         if training and torch.is_grad_enabled():
-            outputs = _Decision.apply(self, x, view, beside, *self._differentiated)  # type: ignore[no-untyped-call]
+            outputs = _Decision.apply(self, x, parameters, other_inputs, *self._differentiated)  # type: ignore[no-untyped-call]
         else:
             with torch.no_grad():
-                outputs, _ = self._outputs(x, view, training, beside, None)
+                outputs, _ = self._outputs(x, parameters, training, other_inputs, None)
         if self._is_mean:
             return list(outputs)
         readout = self._network.readout
         return [readout.q_values(readout.integrate(output_TBA)) for output_TBA in outputs]
 
     def _outputs(
-        self, x: Tensor, view: TaskView, training: bool, beside: Sequence[Tensor], layers: list[Gradients] | None
-    ) -> tuple[list[Tensor], WayBack]:
-        """What the heads send on, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``; and the first one's way back, through
-        what is appended to ``layers``."""
-        others = [self._features(other, view, training=False) for other in beside]  # first: training moves averages
-        ys, of_streams = connected([self._features(x, view, training, layers), *others], self._streams)
-        fired = [self._neurons.fire(y_TBN, Currents(view.gain_N), self._last_form) for y_TBN in ys]
-        outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
-        # The way back holds on to nothing of the others, nor to what it leads back from.
-        y_TBN, (spikes_SBN, currents_4N), shape = ys[0], fired[0], outputs[0].shape
-        task, version = view.task, self._version
+        self,
+        x: Tensor,
+        parameters: TaskParameters,
+        training: bool,
+        other_inputs: Sequence[Tensor],
+        layers: list[Gradients] | None,
+    ) -> tuple[list[Tensor], Backward]:
+        """Outputs of the heads, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``, and the backward of the first ones.
 
-        def way_back(grad: Tensor) -> list[Tensor]:
+        Each trunk layer's backward is appended to ``layers``, which the returned function empties from the end.
+        """
+        # Others first: training moves the running statistics.
+        others = [self._features(other, parameters, training=False) for other in other_inputs]
+        ys, of_streams = connected([self._features(x, parameters, training, layers), *others], self._streams)
+        fired = [self._neurons.fire(y_TBN, Currents(parameters.gain_N), self._last_form) for y_TBN in ys]
+        outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
+        # The backward keeps only the first input's activations alive, and not its own outputs.
+        y_TBN, (spikes_SBN, currents_4N), shape = ys[0], fired[0], outputs[0].shape
+        task, version = parameters.task, self._version
+
+        def backward(grad: Tensor) -> list[Tensor]:
             if not layers:
-                raise RuntimeError("a second way back, expected one for each decision")
+                raise RuntimeError("a second backward, expected one for each decision")
             if self._version_now() != version:
-                raise RuntimeError("parameters have changed since the decision, expected its gradient first")
+                raise RuntimeError("parameters have changed since the decision, expected its backward first")
             steps, grad_SBA = self._neurons.timesteps, grad.contiguous().view(shape)
             scale = 1.0 / steps if self._is_mean else 1.0
             grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBA, scale)
-            grad_y, (grad_gain_N, _) = self._neurons.unfire(y_TBN, currents_4N, grad_SBN.expand(steps, -1, -1))
+            grad_TBN = grad_SBN.expand(steps, -1, -1)
+            grad_y, (grad_gain_N, _) = self._neurons.fire_backward(y_TBN, currents_4N, grad_TBN)
             of_gains = self._gains.gradients(task, grad_gain_N)
             grad_x, of_synapses = of_streams(grad_y, True)
             parts = [*of_synapses, *of_gains, *of_heads]
-            while layers:  # what a layer kept is let go
-                of_layer = layers.pop()
-                grad_x, some = of_layer(cast(Tensor, grad_x), bool(layers))
-                parts = [*some, *parts]
+            while layers:  # frees what each layer saved
+                layer_backward = layers.pop()
+                grad_x, of_layer = layer_backward(cast(Tensor, grad_x), bool(layers))
+                parts = [*of_layer, *parts]
             return parts
 
-        return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], way_back
+        return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], backward
 
-    def _features(self, x: Tensor, view: TaskView, training: bool, layers: list[Gradients] | None = None) -> Spikes:
-        """What the trunk sends to the streams; each layer's way back is appended to ``layers``, if there is one."""
+    def _features(
+        self, x: Tensor, parameters: TaskParameters, training: bool, layers: list[Gradients] | None = None
+    ) -> Spikes:
+        """What the trunk sends to the streams. Each layer's backward is appended to ``layers``, if given."""
         spikes = Spikes(x, x.shape[-1])
         for name, layer in self._trunk.items():
-            spikes, gradients = layer.fire(spikes, view.context[name], training)
+            spikes, gradients = layer.fire(spikes, parameters.context[name], training)
             if layers is not None:
                 layers.append(gradients)
         return spikes
@@ -187,7 +207,7 @@ class _Layer:
             self._currents = Currents(weight_C, bias_C, epsilon=self._normalization.epsilon)
 
     def fire(self, x: Spikes, context: tuple[Tensor, ...], training: bool) -> tuple[Spikes, Gradients]:
-        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and from their gradient to those of ``x`` and the parameters."""
+        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and the backward, to ``x`` and the parameters."""
         neurons, normalization, currents = self._neurons, self._normalization, self._currents
         if normalization is None:
             (y,), of_products = connected([x], self.synapses)
@@ -198,24 +218,29 @@ class _Layer:
             if training:
                 mean_C, var_C = batch_moments(y_SRC, (mean_C, var_C), normalization.momentum)
             currents = currents._replace(mean_C=mean_C, variance_C=var_C)
-        memory, currents_4C = neurons.fire(y_SRC, currents, self._form)
+        values, currents_4C = neurons.fire(y_SRC, currents, self._form)
 
         def gradients(grad: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
             grad_TRC = grad.view(neurons.timesteps, *y_SRC.shape[1:])
-            grad_y, grad_2C = neurons.unfire(y_SRC, currents_4C, grad_TRC)
+            grad_y, grad_2C = neurons.fire_backward(y_SRC, currents_4C, grad_TRC)
             grad_x, parts = of_products(grad_y, of_inputs)
             return grad_x, parts if normalization is None else [*parts, *grad_2C]
 
-        shape = (neurons.timesteps, *y.shape[1:-1], memory.shape[-1])
-        return Spikes(memory.view(shape), y.shape[-1], self._form == "bits"), gradients
+        shape = (neurons.timesteps, *y.shape[1:-1], values.shape[-1])
+        return Spikes(values.view(shape), y.shape[-1], self._form == "bits"), gradients
 
 
 class _Decision(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, network: NativeNetwork, x: Tensor, view: TaskView, beside: Sequence[Tensor], *parameters: Tensor
+        ctx: Any,
+        network: NativeNetwork,
+        x: Tensor,
+        task_parameters: TaskParameters,
+        other_inputs: Sequence[Tensor],
+        *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
-        outputs, ctx.way_back = network._outputs(x, view, True, beside, [])
+        outputs, ctx.network_backward = network._outputs(x, task_parameters, True, other_inputs, [])
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[1:])
         return tuple(outputs)
@@ -223,4 +248,4 @@ class _Decision(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, None, None, *ctx.way_back(gradients[0])
+        return None, None, None, None, *ctx.network_backward(gradients[0])

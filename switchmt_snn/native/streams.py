@@ -1,6 +1,6 @@
-"""What lies around the streams' products, in C++ (``native_streams.cpp``): gains of the active dendrites, and heads.
+"""Gains of the active dendrites, and heads, in C++ (``csrc/streams.cpp``).
 
-There is hardly anything to compute, but PyTorch takes some fifty single operations for it.
+They are few multiplications, but PyTorch takes some fifty single operations for them.
 
 Shapes: S steps of the spikes (T, or 1 for their mean), B batch, N neurons of all streams, A actions.
 """
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from switchmt_snn.native.library import library
+from switchmt_snn.native.pointers import FLOAT32, pointer
 from switchmt_snn.spiking.network import QNetwork, Stream
 
 
@@ -23,15 +24,15 @@ class _Dendrites(NamedTuple):
     by_size: bool
     """Whether the response that is largest in absolute value wins."""
     first: int
-    """Of the stream's neurons among those of all streams."""
+    """Index of the stream's first neuron among those of all streams."""
     neurons: int
 
-    def what(self, task: int) -> tuple[int, ...]:
-        """Where the segments lie, how many there are, and how one wins; IndexError for a task that there is not."""
+    def arguments(self, task: int) -> tuple[int, ...]:
+        """Arguments of the C++ call: pointer, shape, task and gating rule. Raises IndexError for an unknown task."""
         tasks = self.segments_NSK.shape[2]
         if not 0 <= task < tasks:
             raise IndexError(f"task {task}, expected 0 to {tasks - 1}")
-        return _numbers(self.segments_NSK, tasks), *self.segments_NSK.shape, task, self.by_size
+        return pointer(self.segments_NSK, FLOAT32), *self.segments_NSK.shape, task, self.by_size
 
 
 class Gains:
@@ -55,30 +56,32 @@ class Gains:
         """``[N]``, one stream after the other.
 
         Raises:
-            IndexError: there is no such task.
+            IndexError: unknown task.
         """
         gain_N = torch.ones(self._neurons)
         for part in self._dendrites:
-            library().snn_gains(*part.what(task), gain_N.data_ptr() + part.first * 4, part.neurons)
+            library().snn_gains(*part.arguments(task), gain_N.data_ptr() + part.first * 4, part.neurons)
         return gain_N
 
     def gradients(self, task: int, grad_gain_N: Tensor) -> list[Tensor]:
-        """Of :attr:`parameters`, from that of :meth:`of_task`.
+        """Gradients of :attr:`parameters`, from that of :meth:`of_task`.
 
         Raises:
-            IndexError: there is no such task.
+            IndexError: unknown task.
             ValueError: the gradient is not contiguous float32 of all neurons.
         """
-        gradients, place = [], _numbers(grad_gain_N, self._neurons)
+        gradients, first = [], pointer(grad_gain_N, FLOAT32, (self._neurons,))
         for part in self._dendrites:
             gradient = torch.empty_like(part.segments_NSK)
-            places = place + part.first * 4, gradient.data_ptr()
-            library().snn_gains_gradient(*part.what(task), *places, part.neurons)
+            pointers = first + part.first * 4, gradient.data_ptr()
+            library().snn_gains_backward(*part.arguments(task), *pointers, part.neurons)
             gradients.append(gradient)
         return gradients
 
 
 class _Head(ctypes.Structure):
+    """``struct Head`` of ``csrc/streams.cpp``."""
+
     _fields_ = (
         ("weight", ctypes.c_void_p),
         ("bias", ctypes.c_void_p),
@@ -98,7 +101,7 @@ class Heads:
     """
 
     def __init__(self, network: QNetwork) -> None:
-        """Nothing is read yet; see :meth:`read`."""
+        """Reads no parameter yet; see :meth:`read`."""
         layers = {name: cast(Stream, stream).head for name, stream in network.streams.items()}
         self.parameters = tuple(part for layer in layers.values() for part in (layer.weight, layer.bias))
         outputs = [layer.out_features for layer in layers.values()]
@@ -113,16 +116,17 @@ class Heads:
             head.inputs, head.outputs = layer.in_features, layer.out_features
 
     def read(self) -> None:
-        """Make the matrix that of the parameters as they are now.
+        """Make the matrix from the parameters as they are now.
 
         Raises:
             ValueError: they are not contiguous float32.
         """
         actions, neurons = self._weight_AN.shape
         for head, weight, bias in zip(self._heads, self.parameters[::2], self.parameters[1::2], strict=True):
-            head.weight, head.bias = _numbers(weight, head.inputs), _numbers(bias, head.outputs)
-        places = self._weight_AN.data_ptr(), self._bias_A.data_ptr()
-        library().snn_heads(ctypes.addressof(self._heads), len(self._heads), *places, neurons, actions)
+            head.weight = pointer(weight, FLOAT32, (head.outputs, head.inputs))
+            head.bias = pointer(bias, FLOAT32, (head.outputs,))
+        combined = self._weight_AN.data_ptr(), self._bias_A.data_ptr()
+        library().snn_combine_heads(ctypes.addressof(self._heads), len(self._heads), *combined, neurons, actions)
 
     def outputs(self, spikes_SBN: Tensor) -> Tensor:
         """``[S, B, A]`` for float32 spikes: Q-values, if the heads are all that follows.
@@ -133,12 +137,13 @@ class Heads:
         steps, batch, _ = spikes_SBN.shape
         actions, neurons = self._weight_AN.shape
         q_SBA = torch.empty(steps, batch, actions)
-        places = _numbers(spikes_SBN, neurons), self._weight_AN.data_ptr(), self._bias_A.data_ptr(), q_SBA.data_ptr()
-        library().snn_read_out(*places, steps * batch, neurons, actions, torch.get_num_threads())
+        spikes = pointer(spikes_SBN, FLOAT32, (None, None, neurons))
+        pointers = spikes, self._weight_AN.data_ptr(), self._bias_A.data_ptr(), q_SBA.data_ptr()
+        library().snn_read_out(*pointers, steps * batch, neurons, actions, torch.get_num_threads())
         return q_SBA
 
     def gradients(self, spikes_SBN: Tensor, grad_SBA: Tensor, scale: float) -> tuple[Tensor, list[Tensor]]:
-        """Of the spikes, times a scale, and of :attr:`parameters`.
+        """Gradients of the spikes, times a scale, and of :attr:`parameters`.
 
         Raises:
             ValueError: spikes or gradient are not contiguous float32 of all neurons or actions.
@@ -147,15 +152,10 @@ class Heads:
         grad_spikes, gradients = torch.empty_like(spikes_SBN), [torch.empty_like(part) for part in self.parameters]
         for head, weight, bias in zip(self._heads, gradients[::2], gradients[1::2], strict=True):
             head.grad_weight, head.grad_bias = weight.data_ptr(), bias.data_ptr()
-        numbers = self._weight_AN.data_ptr(), _numbers(spikes_SBN, neurons), _numbers(grad_SBA, actions)
+        spikes = pointer(spikes_SBN, FLOAT32, (None, None, neurons))
+        grad = pointer(grad_SBA, FLOAT32, (*spikes_SBN.shape[:2], actions))
         sizes = (rows, neurons, actions, torch.get_num_threads())
         heads = ctypes.addressof(self._heads), len(self._heads)
-        library().snn_heads_gradient(*heads, *numbers, scale, grad_spikes.data_ptr(), *sizes)
+        pointers = self._weight_AN.data_ptr(), spikes, grad
+        library().snn_heads_backward(*heads, *pointers, scale, grad_spikes.data_ptr(), *sizes)
         return grad_spikes, gradients
-
-
-def _numbers(x: Tensor, last: int) -> int:
-    """Where they lie; ValueError for what C++ would read wrongly."""
-    if x.dtype != torch.float32 or not x.is_cpu or not x.is_contiguous() or x.shape[-1] != last:
-        raise ValueError(f"{x.dtype} {tuple(x.shape)} on {x.device}, expected contiguous float32 [..., {last}]")
-    return x.data_ptr()

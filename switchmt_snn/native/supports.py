@@ -92,7 +92,20 @@ def require(network: QNetwork) -> None:
     Raises:
         ConfigError: it has an unsupported setting or module; the message names it.
     """
-    unsupported = unsupported_setting(network.config) or unsupported_module(network)
+    require_setting(network.config)
+    _refuse(unsupported_module(network))
+
+
+def require_setting(config: NetworkConfig) -> None:
+    """Refuse settings that the C++ code does not support.
+
+    Raises:
+        ConfigError: there is one; the message names it.
+    """
+    _refuse(unsupported_setting(config))
+
+
+def _refuse(unsupported: str | None) -> None:
     if unsupported is not None:
         raise ConfigError(
             f"learning.engine is 'native', expected a network that it supports, but it has no code for {unsupported}; "
@@ -160,4 +173,4 @@ _STREAM_PARTS: dict[str, _Check] = {
 
 
 def _named(name: str, module: nn.Module | None) -> str:
-    return f"{name}: {module}" if module is not None else f"{name}: none"
+    return f"{name}: {' '.join(str(module).split())}"  # on one line

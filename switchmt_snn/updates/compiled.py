@@ -27,7 +27,7 @@ class Compiled(Engine):
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
         super().__init__(network, target, config)
         differentiated = DifferentiatedPass(network, self.precision)
-        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q, compiled)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q, compile_whole)
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
@@ -52,7 +52,7 @@ class Compiled(Engine):
         return self._passes(observations, next_observations, task, generator)
 
 
-def compiled(function: Encoded) -> Encoded:
+def compile_whole(function: Encoded) -> Encoded:
     """The function as one compiled graph for tensors of fixed shapes."""
     from torch import _dynamo as dynamo  # takes a second to import
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from switchmt_snn.config import ExperimentConfig, LearningConfig
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.spiking.network import QNetwork
-from switchmt_snn.updates.compiled import compiled
+from switchmt_snn.updates.compiled import compile_whole
 from switchmt_snn.updates.passes import DifferentiatedPass, forward_passes
 from switchmt_snn.updates.protocol import DeviceBatch, Engine, Step, Values, adam
 
@@ -31,7 +31,7 @@ class CudaGraph(Engine):
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
         super().__init__(network, target, config)
         differentiated = DifferentiatedPass(network, self.precision)
-        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q, compiled)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q, compile_whole)
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:

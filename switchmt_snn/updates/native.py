@@ -24,7 +24,7 @@ class Native(Engine):
     note = "updates run natively, in C++ (learning.engine=eager does without)"
 
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
-        """Raises ValueError for a network that the C++ code does not support, naming what it does not."""
+        """Raises ConfigError for a network that the C++ code does not support, naming the setting or module."""
         super().__init__(network, target, config)
         from switchmt_snn.native.network import NativeNetwork
 
@@ -75,11 +75,11 @@ class Native(Engine):
         online, target, double_q = self._online, self._target, self.config.double_q
         x_next = target.inputs(next_observations, generator)
         with torch.no_grad():
-            (next_BA,) = target.decide(x_next, target.view(task), training=False)
+            (next_BA,) = target.decide(x_next, target.for_task(task), training=False)
         if double_q and self.network.encoder.is_random:
             x_next = online.inputs(next_observations, generator)
         x, others = online.inputs(observations, generator), [x_next] if double_q else []
-        q_BA, *choice = online.decide(x, online.view(task), training=True, beside=others)
+        q_BA, *choice = online.decide(x, online.for_task(task), training=True, other_inputs=others)
         return Values(q_BA, next_BA, *(choice or [next_BA]))
 
     def optimizer(self) -> torch.optim.Optimizer:

@@ -21,7 +21,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from switchmt_snn.updates.choice import compile_problem
+from switchmt_snn.updates.compiled import compile_problem
 
 COMMAND = [sys.executable, "-m", "switchmt_snn"]
 CONFIG = """

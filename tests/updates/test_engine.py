@@ -16,9 +16,9 @@ import torch
 from switchmt_snn.config import ExperimentConfig, resolve
 from switchmt_snn.config.yaml_io import load_config
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.native import library as native_library
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.updates import choice as machine
+from switchmt_snn.updates import compiled
 from switchmt_snn.updates.engine import ENGINES
 from tests.conftest import small_config
 
@@ -68,8 +68,8 @@ def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | No
     return {**{k: v.detach() for k, v in values._asdict().items()}, **grads, **dict(network.named_buffers())}
 
 
-compiles = pytest.mark.skipif(machine.compile_problem() is not None, reason="nothing can be compiled here")
-builds = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
+compiles = pytest.mark.skipif(compiled.compile_problem() is not None, reason="nothing can be compiled here")
+builds = pytest.mark.skipif(not ENGINES["native"].status().startswith("works"), reason="no C++ compiler")
 
 
 @compiles
@@ -160,18 +160,18 @@ def test_a_run_keeps_the_engine_it_began_with() -> None:
 @compiles
 def test_auto_compiles_long_runs_only() -> None:
     short, no_words = machine.settle(small_config(), None, CPU)
-    long, words = machine.settle(small_config(total_steps=machine.COMPILE_FROM_UPDATES), None, CPU)
+    long, words = machine.settle(small_config(total_steps=compiled.COMPILE_FROM_UPDATES), None, CPU)
     assert (short.learning.engine, no_words) == ("eager", [])
     assert long.learning.engine == "compiled"
     assert len(words) == 1
     assert "first" in words[0]
     every = {"update_every_steps": 4, "update_tasks": "all"}  # two tasks: one update per two steps
-    assert machine.planned_updates(small_config(total_steps=1000, learning=every)) == 500
+    assert compiled.planned_updates(small_config(total_steps=1000, learning=every)) == 500
 
 
 def test_without_a_compiler_auto_says_so_and_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "compile_problem", lambda: "no g++")
-    settled, words = machine.settle(small_config(total_steps=machine.COMPILE_FROM_UPDATES), None, CPU)
+    monkeypatch.setattr(compiled, "compile_problem", lambda: "no g++")
+    settled, words = machine.settle(small_config(total_steps=compiled.COMPILE_FROM_UPDATES), None, CPU)
     assert settled.learning.engine == "eager"
     assert "no g++" in words[0]
     with pytest.raises(ConfigError, match=r"learning\.engine is 'compiled'.*no g\+\+.*eager"):

@@ -1,5 +1,5 @@
-// Adam (Kingma & Ba 2015, arXiv 1412.6980) on many tensors in one pass over memory, with PyTorch's state; where a weight has
-// a copy that products read, the pass writes it, too.
+// Adam (Kingma & Ba 2015, arXiv 1412.6980) on many tensors in one pass over memory, with PyTorch's state; if products
+// read a copy of a weight, the pass writes that, too.
 
 #include <algorithm>
 #include <cmath>
@@ -13,10 +13,10 @@ namespace {
 struct Tensor {
     float *parameter, *mean, *square;  // of the gradients, exponential
     const float* gradient;
-    float* step;  // number of them
-    void* copy;   // or none
-    long size, low;         // numbers; whether the copy is bfloat16
-    long channels, places;  // numbers [...][channels][places] have the copy [...][places][channels]
+    float* step;  // number of steps made
+    void* copy;   // for products, or null
+    long size, copy_is_bf16;   // values; whether the copy is bfloat16
+    long channels, positions;  // values [...][channels][positions] have the copy [...][positions][channels]
 };
 
 inline Lanes root(Lanes x) {
@@ -40,12 +40,12 @@ void move(const Tensor& t, Copy* copy, long first, long end, double rate, double
         store(t.square + i, square, width);
         store(t.parameter + i, parameter, width);
         if (!copy) continue;
-        if (t.places == 1)
+        if (t.positions == 1)
             store(copy + i, parameter, width);
         else
             for (long j = i; j < i + width; j++) {
-                long place = j % t.places, channel = j / t.places % t.channels;
-                put(copy + (j - channel * t.places - place) + place * t.channels + channel, parameter[j - i]);
+                long position = j % t.positions, channel = j / t.positions % t.channels;
+                put(copy + (j - channel * t.positions - position) + position * t.channels + channel, parameter[j - i]);
             }
     }
 }
@@ -69,7 +69,7 @@ extern "C" void snn_adam(const Tensor* tensors, long count, double rate, double 
     for (size_t i = 0; i < parts.size(); i++) {
         const Tensor& t = tensors[parts[i].tensor];
         long first = parts[i].first, end = std::min(t.size, first + PART);
-        if (t.low)
+        if (t.copy_is_bf16)
             move(t, (BFloat16*)t.copy, first, end, rate, beta1, beta2, float(epsilon));
         else
             move(t, (float*)t.copy, first, end, rate, beta1, beta2, float(epsilon));

@@ -1,5 +1,5 @@
-// Products of bfloat16 numbers with sums in single precision (AVX512-BF16). One instruction multiplies pairs of numbers and
-// adds both products to a sum, so one factor is packed with the two numbers of a pair side by side, and of the other one
+// Products of bfloat16 values with sums in single precision (AVX512-BF16). One instruction multiplies pairs of values and
+// adds both products to a sum, so one factor is packed with the two values of a pair side by side, and of the other one
 // a pair is repeated in all lanes. Images have their channels innermost.
 //
 // Every sum has one order, so it does not depend on the threads.
@@ -179,7 +179,7 @@ void snn_convolve(const BFloat16* x, const BFloat16* weights, const float* bias,
 // convolution of the outputs' gradient with stride 1 and kernel / stride taps.
 // grad_x [images][height * stride][width * stride][C] from grad_y [images][height - taps + 1][width - taps + 1][O] and
 // weights [O][taps * stride][taps * stride][C]; O is even, C a multiple of CHANNELS.
-void snn_input_gradient(const BFloat16* grad_y, const BFloat16* weights, BFloat16* grad_x, long images, long height,
+void snn_convolve_input_gradient(const BFloat16* grad_y, const BFloat16* weights, BFloat16* grad_x, long images, long height,
                         long width, long O, long C, long taps, long stride, int threads) {
     long blocks = C / CHANNELS, phases = stride * stride, kernel = taps * stride, row_pairs = taps * O / 2;
     long down = height - taps + 1, across = width - taps + 1, row = (width + taps - 1) * O;
@@ -219,7 +219,7 @@ void snn_input_gradient(const BFloat16* grad_y, const BFloat16* weights, BFloat1
 // Gradients of a convolution's weights [O][kernel][kernel][C] and bias [O] from x [images][height][width][C] and grad_y
 // [images][h][w][O], O being a multiple of CHANNELS. A pair are two windows side by side;
 // the last of an odd number has zeros beside it, so inputs are finite.
-void snn_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_weights, float* grad_bias, long images,
+void snn_convolve_weight_gradient(const BFloat16* x, const BFloat16* grad_y, float* grad_weights, float* grad_bias, long images,
                          long height, long width, long C, long O, long kernel, long stride, int threads) {
     long down = (height - kernel) / stride + 1, across = (width - kernel) / stride + 1, window_pairs = (across + 1) / 2;
     long blocks = O / CHANNELS, depth = kernel * C, step = stride * C, size = kernel * depth;

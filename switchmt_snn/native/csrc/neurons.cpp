@@ -1,7 +1,7 @@
 // Input currents y * scale + shift of each channel and T steps of leaky integrate-and-fire neurons on them, in one pass
 // over memory, and the gradients of both, in two. The arithmetic is that of neurons.py, step by step.
 //
-// y [T or 1][R][C], spikes [T][R][C]: rows R (batch times places), channels C innermost. A stride of 0 (y_step, g_step)
+// y [T or 1][R][C], spikes [T][R][C]: rows R (batch times positions), channels C innermost. A stride of 0 (y_step, g_step)
 // says that every step shares one [R][C]. Sums run over a fixed number of parts, so they do not depend on the threads.
 
 #include <algorithm>
@@ -22,7 +22,7 @@ constexpr long PARTS = 64;
 
 struct Neuron {
     float beta, threshold, slope;  // the last one of the surrogate gradient
-    int zero, fast_sigmoid;        // reset to zero, else by subtraction; fast sigmoid, else arctangent
+    int resets_to_zero, is_fast_sigmoid;  // else reset by subtraction; else arctangent
 };
 
 template <bool FAST_SIGMOID>
@@ -130,7 +130,7 @@ void fire_mean(Neuron n, const Y* y, long y_step, const float* scale, const floa
 
 // The currents' gradient [T or 1][R][C], its sum [C] over steps and rows, and that of its product with y - center.
 template <bool ZERO, bool FAST_SIGMOID, class Y, class G>
-void unfire(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, const float* center,
+void fire_backward(Neuron n, const Y* y, long y_step, const float* scale, const float* shift, const float* center,
             const G* grad_spikes, long g_step, float* grad, double* sums, long steps, long rows, long channels,
             int threads) {
     std::vector<float> partial(PARTS * 2 * channels, 0.0f);
@@ -138,7 +138,7 @@ void unfire(Neuron n, const Y* y, long y_step, const float* scale, const float* 
 #pragma omp parallel num_threads(threads)
     {
         std::vector<Lanes> scratch(steps * 4);  // of two vectors, membranes and spikes
-        Lanes* kept = scratch.data();
+        Lanes* saved = scratch.data();
 #pragma omp for schedule(static)
         for (long part = 0; part < PARTS; part++)
             for (long r = rows * part / PARTS; r < rows * (part + 1) / PARTS; r++)
@@ -147,21 +147,21 @@ void unfire(Neuron n, const Y* y, long y_step, const float* scale, const float* 
                     long at = r * channels + c;
                     integrate<ZERO, V>(n, y + at, y_step, scale + c, shift + c, steps, width,
                                        [=](long t, int v, Lanes u, Lanes fired, Flags) {
-                                           kept[t * 2 * V + v] = u, kept[(t * 2 + 1) * V + v] = fired;
+                                           saved[t * 2 * V + v] = u, saved[(t * 2 + 1) * V + v] = fired;
                                        });
                     float *sum = sums_of_parts + part * 2 * channels + c, *sum_y = sum + channels;
-                    Lanes after[V] = {}, total[V] = {}, middle[V], product[V];
+                    Lanes grad_u[V] = {}, total[V] = {}, middle[V], product[V];
                     for (int v = 0; v < V; v++)
                         middle[v] = load(center + c + v * WIDTH, width), product[v] = load(sum_y + v * WIDTH, width);
                     for (long t = steps - 1; t >= 0; t--)
                         for (int v = 0; v < V; v++) {
-                            Lanes before = ZERO ? after[v] - after[v] * kept[(t * 2 + 1) * V + v] : after[v];
-                            Lanes slope = surrogate<FAST_SIGMOID>(n, kept[t * 2 * V + v] - n.threshold);
-                            after[v] = load(grad_spikes + t * g_step + at + v * WIDTH, width) * slope + before * n.beta;
-                            total[v] += after[v];
+                            Lanes through_reset = ZERO ? grad_u[v] - grad_u[v] * saved[(t * 2 + 1) * V + v] : grad_u[v];
+                            Lanes slope = surrogate<FAST_SIGMOID>(n, saved[t * 2 * V + v] - n.threshold);
+                            grad_u[v] = load(grad_spikes + t * g_step + at + v * WIDTH, width) * slope + through_reset * n.beta;
+                            total[v] += grad_u[v];
                             if (y_step != 0) {
-                                store(grad + t * rows * channels + at + v * WIDTH, after[v], width);
-                                product[v] += after[v] * (load(y + t * y_step + at + v * WIDTH, width) - middle[v]);
+                                store(grad + t * rows * channels + at + v * WIDTH, grad_u[v], width);
+                                product[v] += grad_u[v] * (load(y + t * y_step + at + v * WIDTH, width) - middle[v]);
                             }
                         }
                     for (int v = 0; v < V; v++) {
@@ -237,36 +237,36 @@ void moments(const Y* y, float* mean, float* variance, long rows, long channels,
 }
 
 template <class Y>
-void images(const uint8_t* x, float scale, Y* out, long batch, long channels, long places, int threads) {
+void scale_images(const uint8_t* x, float scale, Y* out, long batch, long channels, long positions, int threads) {
     constexpr long BLOCK = 64;
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (long b = 0; b < batch; b++)
-        for (long p = 0; p < places; p += BLOCK) {
-            const uint8_t* from = x + b * channels * places + p;
-            Y* to = out + (b * places + p) * channels;
+        for (long p = 0; p < positions; p += BLOCK) {
+            const uint8_t* from = x + b * channels * positions + p;
+            Y* to = out + (b * positions + p) * channels;
             auto interleave = [=](long width, long cs) {
                 for (long i = 0; i < width; i++)
-                    for (long c = 0; c < cs; c++) put(to + i * cs + c, float(from[c * places + i]) * scale);
+                    for (long c = 0; c < cs; c++) put(to + i * cs + c, float(from[c * positions + i]) * scale);
             };
-            if (channels == 4 && places - p >= BLOCK)
+            if (channels == 4 && positions - p >= BLOCK)
                 interleave(BLOCK, 4);  // constants, which the compiler makes much of
             else
-                interleave(std::min(BLOCK, places - p), channels);
+                interleave(std::min(BLOCK, positions - p), channels);
         }
 }
 
-// [images][channels][places] to [images][places][channels].
+// [images][channels][positions] to [images][positions][channels].
 template <class X>
-void channels_last(const X* x, X* out, long images, long channels, long places, int threads) {
+void channels_last(const X* x, X* out, long images, long channels, long positions, int threads) {
     constexpr long BLOCK = 32;
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (long i = 0; i < images; i++)
         for (long c = 0; c < channels; c += BLOCK) {
             auto turn = [=](long width) {
-                const X* from = x + (i * channels + c) * places;
-                X* to = out + i * places * channels + c;
-                for (long p = 0; p < places; p++, to += channels)
-                    for (long j = 0; j < width; j++) to[j] = from[j * places + p];
+                const X* from = x + (i * channels + c) * positions;
+                X* to = out + i * positions * channels + c;
+                for (long p = 0; p < positions; p++, to += channels)
+                    for (long j = 0; j < width; j++) to[j] = from[j * positions + p];
             };
             channels - c >= BLOCK ? turn(BLOCK) : turn(channels - c);
         }
@@ -279,14 +279,14 @@ void with_flag(bool flag, F f) {
 }
 
 template <class F>
-void with_type(bool low, F f) {
-    low ? f(BFloat16()) : f(float());
+void with_type(bool is_bf16, F f) {
+    is_bf16 ? f(BFloat16()) : f(float());
 }
 
 template <class F>
-void with_types(bool low, bool other_low, F f) {  // all floats, all bfloat16, or floats beside bfloat16 currents
-    if (!low) return f(float(), float());
-    other_low ? f(BFloat16(), BFloat16()) : f(BFloat16(), float());
+void with_types(bool is_bf16, bool other_is_bf16, F f) {  // all floats, all bfloat16, or floats with bfloat16 currents
+    if (!is_bf16) return f(float(), float());
+    other_is_bf16 ? f(BFloat16(), BFloat16()) : f(BFloat16(), float());
 }
 
 }  // namespace
@@ -294,12 +294,12 @@ void with_types(bool low, bool other_low, F f) {  // all floats, all bfloat16, o
 extern "C" {
 
 // Spikes of T steps; currents are made for them, and kept for their gradient.
-void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const float* a, const float* b, const float* mean,
-              const float* variance, float epsilon, float* currents, void* spikes, int spikes_low, long steps, long rows,
+void snn_fire(const Neuron* n, const void* y, int y_is_bf16, long y_step, const float* a, const float* b, const float* mean,
+              const float* variance, float epsilon, float* currents, void* spikes, int spikes_are_bf16, long steps, long rows,
               long channels, int threads) {
     make_currents(a, b, mean, variance, epsilon, currents, channels);
-    with_flag(n->zero, [&](auto zero) {
-        with_types(y_low, spikes_low, [&](auto y_, auto s_) {
+    with_flag(n->resets_to_zero, [&](auto zero) {
+        with_types(y_is_bf16, spikes_are_bf16, [&](auto y_, auto s_) {
             fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (decltype(s_)*)spikes,
                              steps, rows, channels, threads);
         });
@@ -307,12 +307,12 @@ void snn_fire(const Neuron* n, const void* y, int y_low, long y_step, const floa
 }
 
 // The same spikes as bits: channel c is bit c % 32 of words [T][R][ceil(C / 32)].
-void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const float* a, const float* b,
+void snn_fire_bits(const Neuron* n, const void* y, int y_is_bf16, long y_step, const float* a, const float* b,
                    const float* mean, const float* variance, float epsilon, float* currents, void* words, long steps,
                    long rows, long channels, int threads) {
     make_currents(a, b, mean, variance, epsilon, currents, channels);
-    with_flag(n->zero, [&](auto zero) {
-        with_type(y_low, [&](auto y_) {
+    with_flag(n->resets_to_zero, [&](auto zero) {
+        with_type(y_is_bf16, [&](auto y_) {
             fire<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, (uint32_t*)words, steps,
                              rows, channels, threads);
         });
@@ -320,12 +320,12 @@ void snn_fire_bits(const Neuron* n, const void* y, int y_low, long y_step, const
 }
 
 // Their mean over the steps, floats [R][C].
-void snn_fire_mean(const Neuron* n, const void* y, int y_low, long y_step, const float* a, const float* b,
+void snn_fire_mean(const Neuron* n, const void* y, int y_is_bf16, long y_step, const float* a, const float* b,
                    const float* mean, const float* variance, float epsilon, float* currents, float* spikes, long steps,
                    long rows, long channels, int threads) {
     make_currents(a, b, mean, variance, epsilon, currents, channels);
-    with_flag(n->zero, [&](auto zero) {
-        with_type(y_low, [&](auto y_) {
+    with_flag(n->resets_to_zero, [&](auto zero) {
+        with_type(y_is_bf16, [&](auto y_) {
             fire_mean<zero.value>(*n, (const decltype(y_)*)y, y_step, currents, currents + channels, spikes, steps, rows,
                                   channels, threads);
         });
@@ -334,15 +334,15 @@ void snn_fire_mean(const Neuron* n, const void* y, int y_low, long y_step, const
 
 // Gradients of y, and of a and b (grad_ab [2][C]), from those of the spikes. With an inverse deviation, mean and deviation
 // are those of y itself, and follow it. scratch is of y's size.
-void snn_unfire(const Neuron* n, const void* y, int y_low, long y_step, const float* currents, const void* grad_spikes,
-                int grad_low, long g_step, float* scratch, void* grad_y, float* grad_ab, long steps, long rows,
+void snn_fire_backward(const Neuron* n, const void* y, int y_is_bf16, long y_step, const float* currents, const void* grad_spikes,
+                int grad_is_bf16, long g_step, float* scratch, void* grad_y, float* grad_ab, long steps, long rows,
                 long channels, int threads) {
     const float *scale = currents, *shift = scale + channels, *center = shift + channels, *inverse = center + channels;
     std::vector<double> sums(2 * channels, 0.0);
-    with_flag(n->zero, [&](auto zero) {
-        with_flag(n->fast_sigmoid, [&](auto fast) {
-            with_types(y_low, grad_low, [&](auto y_, auto g_) {
-                unfire<zero.value, fast.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, center,
+    with_flag(n->resets_to_zero, [&](auto zero) {
+        with_flag(n->is_fast_sigmoid, [&](auto fast) {
+            with_types(y_is_bf16, grad_is_bf16, [&](auto y_, auto g_) {
+                fire_backward<zero.value, fast.value>(*n, (const decltype(y_)*)y, y_step, scale, shift, center,
                                                (const decltype(g_)*)grad_spikes, g_step, scratch, sums.data(), steps,
                                                rows, channels, threads);
             });
@@ -357,16 +357,16 @@ void snn_unfire(const Neuron* n, const void* y, int y_low, long y_step, const fl
         slope[c] = follows ? -scale[c] * inverse[c] * grad_ab[c] / float(all) : 0.0f;
         constant[c] = follows ? -scale[c] * grad_ab[channels + c] / float(all) : 0.0f;
     }
-    with_type(y_low, [&](auto y_) {
+    with_type(y_is_bf16, [&](auto y_) {
         using Y = decltype(y_);
         combine(scratch, (const Y*)y, scale, center, slope.data(), constant.data(), (Y*)grad_y, all, channels, threads);
     });
 }
 
 // Mean and biased variance of each channel; a running mean and unbiased variance, if there are any, move towards them.
-void snn_moments(const void* y, int y_low, float* mean, float* variance, float* running_mean, float* running_variance,
+void snn_moments(const void* y, int y_is_bf16, float* mean, float* variance, float* running_mean, float* running_variance,
                  float momentum, long rows, long channels, int threads) {
-    with_type(y_low, [&](auto y_) { moments((const decltype(y_)*)y, mean, variance, rows, channels, threads); });
+    with_type(y_is_bf16, [&](auto y_) { moments((const decltype(y_)*)y, mean, variance, rows, channels, threads); });
     if (!running_mean) return;
     float unbiased = float(double(rows) / double(rows - 1));
     for (long c = 0; c < channels; c++) {
@@ -375,16 +375,16 @@ void snn_moments(const void* y, int y_low, float* mean, float* variance, float* 
     }
 }
 
-// Images [B][C][P] of bytes, P places, times scale, to numbers [B][P][C].
-void snn_images(const uint8_t* x, float scale, void* out, int out_low, long batch, long channels, long places,
+// Images [B][C][P] of bytes, P positions, times scale, to values [B][P][C].
+void snn_scale_images(const uint8_t* x, float scale, void* out, int out_is_bf16, long batch, long channels, long positions,
                 int threads) {
-    with_type(out_low, [&](auto o_) { images(x, scale, (decltype(o_)*)out, batch, channels, places, threads); });
+    with_type(out_is_bf16, [&](auto o_) { scale_images(x, scale, (decltype(o_)*)out, batch, channels, positions, threads); });
 }
 
-void snn_channels_last(const void* x, int low, void* out, long images, long channels, long places, int threads) {
-    with_type(low, [&](auto x_) {
+void snn_channels_last(const void* x, int is_bf16, void* out, long images, long channels, long positions, int threads) {
+    with_type(is_bf16, [&](auto x_) {
         using X = decltype(x_);
-        channels_last((const X*)x, (X*)out, images, channels, places, threads);
+        channels_last((const X*)x, (X*)out, images, channels, positions, threads);
     });
 }
 }

@@ -1,4 +1,4 @@
-// Products of a matrix of numbers and a matrix of spikes, a spike being one bit. For four inputs, the sixteen sums that
+// Products of a matrix of weights and a matrix of spikes, a spike being one bit. For four inputs, the sixteen sums that
 // their weights can have lie in one register, and four bits choose one of them: the method of the four Russians (Arlazarov
 // et al., 1970) with a permutation as its table. One permutation is 64 products, in single precision and without
 // rounding them; a fused multiply-add is 16.
@@ -28,7 +28,7 @@ extern "C" int snn_has_products() {
 namespace {
 
 constexpr long LANES = 64;
-constexpr long ROWS = 4;     // of the numbers, worked on together
+constexpr long ROWS = 4;     // of the weights, worked on together
 constexpr long CHUNK = 576;  // bits whose tables stay in the first cache
 constexpr long SUPER = 32;   // panels that one table serves before the next one is made
 
@@ -39,7 +39,7 @@ inline __m512 ones() {
     return one;
 }
 
-// The 16 sums of every 4 numbers of each row: tables [bits / 4][ROWS][16] from a [ROWS][CHUNK].
+// The 16 sums of every 4 weights of each row: tables [bits / 4][ROWS][16] from a [ROWS][CHUNK].
 void make_tables(const float* a, long bits, float* tables) {
     __m512 one = ones();
     for (long k = 0; k < bits; k += 4)
@@ -183,7 +183,7 @@ extern "C" {
 
 // Panels of what a convolution's windows see: lanes are images times output places, bits are window places times
 // channels. spikes [images][height][width][words].
-void snn_windows(const uint32_t* spikes, uint32_t* panels, long images, long height, long width, long words,
+void snn_panels_of_windows(const uint32_t* spikes, uint32_t* panels, long images, long height, long width, long words,
                  long kernel, long stride, int threads) {
     long down = (height - kernel) / stride + 1, across = (width - kernel) / stride + 1;
     long lanes = images * down * across, size = kernel * kernel * words;
@@ -207,7 +207,7 @@ void snn_windows(const uint32_t* spikes, uint32_t* panels, long images, long hei
 }
 
 // Panels of whole images, one per lane: bit c * places + p. spikes [images][places][words of channels].
-void snn_flat(const uint32_t* spikes, uint32_t* panels, long images, long places, long channels, int threads) {
+void snn_panels_of_images(const uint32_t* spikes, uint32_t* panels, long images, long places, long channels, int threads) {
     long from_words = (channels + 31) / 32, words = (channels * places + 31) / 32, room = (places + 15) / 16 * 16;
 #pragma omp parallel num_threads(threads)
     {
@@ -242,7 +242,7 @@ void snn_flat(const uint32_t* spikes, uint32_t* panels, long images, long places
 }
 
 // Panels of the transposed matrix: K lanes of N bits.
-void snn_transpose(const uint32_t* panels, uint32_t* out, long N, long K, int threads) {
+void snn_transpose_panels(const uint32_t* panels, uint32_t* out, long N, long K, int threads) {
     long words = (K + 31) / 32, all = (N + LANES - 1) / LANES, out_words = (N + 31) / 32;
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (long q = 0; q < (words + 1) / 2; q++)
@@ -267,18 +267,18 @@ void snn_transpose(const uint32_t* panels, uint32_t* out, long N, long K, int th
 }
 
 // y [N][M] = spikes [N][K] . a [M][K]^T + bias [M]; both bfloat16 or both floats.
-void snn_multiply(const void* a, int low, const float* bias, const uint32_t* panels, void* y, long M, long K, long N,
+void snn_multiply(const void* a, int is_bf16, const float* bias, const uint32_t* panels, void* y, long M, long K, long N,
                   int threads) {
-    if (low)
+    if (is_bf16)
         multiply<true>((const BFloat16*)a, bias, panels, (BFloat16*)y, M, K, N, threads);
     else
         multiply<true>((const float*)a, bias, panels, (float*)y, M, K, N, threads);
 }
 
 // out [M][N] = a [K][M]^T . spikes [N][K]^T, and the sums [M] of a over K, in floats.
-void snn_multiply_transposed(const void* a, int low, const uint32_t* panels, float* out, float* sums, long M, long K,
+void snn_multiply_transposed(const void* a, int is_bf16, const uint32_t* panels, float* out, float* sums, long M, long K,
                              long N, int threads) {
-    if (low)
+    if (is_bf16)
         multiply<false>((const BFloat16*)a, sums, panels, out, M, K, N, threads);
     else
         multiply<false>((const float*)a, sums, panels, out, M, K, N, threads);

@@ -1,4 +1,4 @@
-// What lies around the products of the streams: gains of the active dendrites (dendrites.py), and the heads with the
+// Gains of the active dendrites (spiking/dendrites.py), and the heads with the
 // combination of their outputs, which is linear, as one matrix; with their gradients. All in single precision.
 //
 // A actions, N neurons of all streams, one stream after the other, R rows (batch, or steps times batch).
@@ -63,7 +63,7 @@ void snn_gains(const float* weights, long rows, long segments, long tasks, long 
 }
 
 // The segments' gradient; the largest share it if they are equal, of the largest by size the first one has it.
-void snn_gains_gradient(const float* weights, long rows, long segments, long tasks, long task, int absolute,
+void snn_gains_backward(const float* weights, long rows, long segments, long tasks, long task, int absolute,
                         const float* grad_gain, float* grad_weights, long neurons) {
     std::fill(grad_weights, grad_weights + rows * segments * tasks, 0.0f);
     for (long row = 0; row < rows; row++) {
@@ -79,7 +79,7 @@ void snn_gains_gradient(const float* weights, long rows, long segments, long tas
 }
 
 // weight [A][N] and bias [A] of all heads and the combination of their outputs.
-void snn_heads(const Head* heads, long count, float* weight, float* bias, long N, long A) {
+void snn_combine_heads(const Head* heads, long count, float* weight, float* bias, long N, long A) {
     std::fill(weight, weight + A * N, 0.0f);
     std::fill(bias, bias + A, 0.0f);
     for (const Head* head = heads; head < heads + count; weight += head->inputs, head++)
@@ -100,7 +100,7 @@ void snn_read_out(const float* spikes, const float* weight, const float* bias, f
 }
 
 // From that of q [R][A]: gradients of the spikes [R][N], times scale, and of all heads.
-void snn_heads_gradient(const Head* heads, long count, const float* weight, const float* spikes, const float* grad_q,
+void snn_heads_backward(const Head* heads, long count, const float* weight, const float* spikes, const float* grad_q,
                         float scale, float* grad_spikes, long R, long N, long A, int threads) {
     std::vector<float> totals(A, 0.0f);
     for (long i = 0; i < R * A; i++) totals[i % A] += grad_q[i];

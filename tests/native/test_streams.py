@@ -6,24 +6,12 @@ from typing import cast
 
 import pytest
 import torch
-from torch import Tensor
 
-from switchmt_snn.config import resolve
 from switchmt_snn.native import library as native_library
 from switchmt_snn.native.streams import Gains, Heads
-from switchmt_snn.spiking.network import ObservationSpec, QNetwork, Stream, build_network
-from tests.conftest import small_config
+from tests.native.networks import network_of, streams_of
 
 pytestmark = pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
-
-
-def network_of(actions: int = 6, **settings: object) -> QNetwork:
-    config = small_config(network={"trunk": "mlp", "hidden_units": 37, **settings})
-    return build_network(resolve(config).network, ObservationSpec((7,), 1, 1.0, True, actions, 3), 1)
-
-
-def streams_of(network: QNetwork) -> list[Stream]:
-    return [cast(Stream, stream) for stream in network.streams.values()]
 
 
 @pytest.mark.parametrize("dendrites", ["shared", "per_neuron"])
@@ -75,32 +63,3 @@ def test_heads_are_those_of_the_network(method: str, steps: int, batch: int, act
         with torch.no_grad():
             for part in heads.parameters:
                 part.normal_()
-
-
-def test_any_number_of_threads_gives_the_same_bits() -> None:
-    heads, threads = Heads(network_of()), torch.get_num_threads()
-    heads.read()
-    spikes, weights, results = torch.rand(3, 40, 74), torch.randn(3, 40, 6), []
-    try:
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            ours, of_heads = heads.gradients(spikes, weights, 1.0)
-            results.append((heads.outputs(spikes), ours, *of_heads))
-    finally:
-        torch.set_num_threads(threads)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-@pytest.mark.parametrize(
-    "spikes", [torch.zeros(1, 4, 73), torch.zeros(1, 4, 74).double(), torch.zeros(1, 4, 148)[..., ::2]]
-)
-def test_what_cplusplus_would_read_wrongly_is_refused(spikes: Tensor) -> None:
-    heads = Heads(network_of())
-    for action in (lambda: heads.outputs(spikes), lambda: heads.gradients(spikes, torch.zeros(1, 4, 6), 1.0)):
-        with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 74\]"):
-            action()
-    with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 3\]"):
-        Gains(streams_of(network_of().double())).of_task(0)
-    with pytest.raises(ValueError, match=r"expected contiguous float32 \[\.\.\., 6\]"):
-        heads.gradients(torch.zeros(1, 4, 74), torch.zeros(1, 4, 7), 1.0)
