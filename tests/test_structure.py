@@ -25,12 +25,6 @@ def test_imports_keep_the_contracts_of_pyproject(
     assert not failed, capsys.readouterr().out
 
 
-def test_only_the_native_engine_imports_native() -> None:
-    importers = {path.relative_to(ROOT).as_posix() for path in sources() if "native" in imported_rooms(path)}
-    inside = {path for path in importers if path.startswith("switchmt_snn/native/")}
-    assert importers - inside == {"switchmt_snn/updates/native.py"}
-
-
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_and_functions_stay_readable(path: Path) -> None:
     text = path.read_text()
