@@ -106,11 +106,16 @@ def layer_shapes(network: FoldedNetwork) -> tuple[LayerShape, ...]:
     """
     shapes: list[LayerShape] = []
     sees_spikes, sees = network.sees_spikes, network.encoded_shape
-    neurons = [*(layer.neurons.kind for layer in network.layers), None]
-    for node, neuron in zip(network.synapses, neurons, strict=True):
-        image = sees if len(sees) == 3 else None
+    for node, neurons in zip(network.synapses, [*(layer.neurons for layer in network.layers), None], strict=True):
         shapes += [
-            replace(shape, spiking_input=sees_spikes, neuron=neuron, input_image=image) for shape in _shapes(node)
+            replace(
+                shape,
+                spiking_input=sees_spikes,
+                input_image=sees if len(sees) == 3 else None,
+                neuron=None if neurons is None else neurons.kind,
+                states=1 if neurons is None else neurons.states,  # the head keeps its sums
+            )
+            for shape in _shapes(node)
         ]
         sees_spikes, sees = network.spiking, node.output_shape
     return tuple(shapes)

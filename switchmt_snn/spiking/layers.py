@@ -210,6 +210,11 @@ class NeuronNode:
         """The model's name in metadata and reports (``IF``, ``LIF``, ``relu``, ...)."""
         raise NotImplementedError(f"{type(self).__name__} has no kind, expected a name")
 
+    @property
+    def states(self) -> int:
+        """State variables of one neuron: its membrane, and what else it keeps from step to step."""
+        raise ExportError(f"{type(self).__name__} does not say how many states it has, expected a property 'states'")
+
     def facts(self) -> dict[str, Any]:
         """Plain values of all parameters; one number where all channels share it."""
         facts: dict[str, Any] = {"neuron": self.kind}

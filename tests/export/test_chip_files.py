@@ -13,12 +13,15 @@ import yaml
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.chips.chip import Chip
 from switchmt_snn.export.chips.chip_file import MAPPINGS, builtin_chips, load_chip, read_chip
-from switchmt_snn.export.chips.fit import check_fit
+from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.rules import RULES, Widths
 from switchmt_snn.export.chips.shapes import LayerShape
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.export.yaml_files import parse
+from switchmt_snn.spiking.neurons import OpaqueNode
 from tests.export.chip_networks import BUILT_IN, chain, conv, linear
+from tests.export.export_cases import make_agent
 
 ROOT = Path(__file__).parents[2]
 CHIP: dict[str, Any] = {
@@ -138,6 +141,32 @@ def test_a_neuron_that_a_chip_does_not_have_is_named_and_does_not_fit(name: str)
         assert (layer.fits, layer.to_dict()["fits"]) == (False, False)
         assert layer.not_held.startswith(f"neuron kind Izhikevich ({name} has IF, LIF")
         assert layer.change == f"not held: {layer.not_held}"
+
+
+@pytest.mark.parametrize(
+    ("neuron", "holding", "states"), [("LIF", set(BUILT_IN), 1), ("Synaptic", set(BUILT_IN) - {"speck"}, 2)]
+)
+def test_neurons_of_real_networks_are_looked_up(neuron: str, holding: set[str], states: int) -> None:
+    shapes = layer_shapes(fold_agent(make_agent(neuron=neuron)))
+    assert [shape.neuron for shape in shapes] == [neuron] * (len(shapes) - 1) + [None]
+    assert [shape.states for shape in shapes] == [states] * (len(shapes) - 1) + [1]
+    held = {name for name in BUILT_IN if not any(layer.not_held for layer in check_fit(shapes, name).layers)}
+    assert held == holding
+
+
+def test_adaptive_neurons_are_held_only_where_neurons_are_programs() -> None:
+    shapes = layer_shapes(fold_agent(make_agent(neuron="ALIF")))
+    held = {name for name in BUILT_IN if not any(layer.not_held for layer in check_fit(shapes, name).layers)}
+    assert held == {"loihi-2", "spinnaker2"}
+    assert shapes[0].states == 2
+
+
+def test_a_neuron_class_of_ones_own_is_not_held_until_a_chip_lists_it() -> None:
+    """Its kind is its name in a config; a chip's file may list that name."""
+    node = OpaqueNode("my_module:MyNeuron", 3)
+    layer = LayerShape("dense", (4,), (2,), None, 1, 8, True, node.kind, states=node.states)
+    assert "neuron kind my_module:MyNeuron" in check_fit([layer], "loihi-2").layers[0].not_held
+    assert check_fit([layer], chip(neurons=["my_module:MyNeuron"])).fits
 
 
 def test_a_layer_that_a_chip_does_not_have_is_named() -> None:

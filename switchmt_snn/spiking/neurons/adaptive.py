@@ -53,6 +53,11 @@ class AdaptiveNode(NeuronNode):
         """``ALIF``."""
         return "ALIF"
 
+    @property
+    def states(self) -> int:
+        """The membrane and the adaptation of the threshold."""
+        return len(AdaptiveLayer.STATE)
+
 
 class AdaptiveLayer(NeuronLayer):
     """Leaky neurons with an adaptive threshold over T steps.

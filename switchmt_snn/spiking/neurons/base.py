@@ -40,14 +40,21 @@ class OpaqueNode(NeuronNode):
 
     Attributes:
         name: the model, as a config names it.
+        variables: number of its state variables.
     """
 
     name: str
+    variables: int
 
     @property
     def kind(self) -> str:
         """The model's name."""
         return self.name
+
+    @property
+    def states(self) -> int:
+        """:attr:`variables`."""
+        return self.variables
 
 
 class NeuronLayer(nn.Module):
@@ -94,7 +101,7 @@ class NeuronLayer(nn.Module):
 
     def node(self, channels: int) -> NeuronNode:
         """The layer's description for exporters and counters; ``channels`` is O."""
-        return OpaqueNode(plugin_name(type(self), "network.neuron"))
+        return OpaqueNode(plugin_name(type(self), "network.neuron"), len(self.STATE))
 
     def forward(self, current: Tensor, state: NeuronState | None = None) -> tuple[Tensor, NeuronState]:
         """Run T steps.

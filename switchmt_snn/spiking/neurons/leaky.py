@@ -47,6 +47,11 @@ class LeakyNode(NeuronNode):
         """``IF`` if no membrane decays, else ``LIF``."""
         return "IF" if (self.beta_O == 1.0).all() else "LIF"
 
+    @property
+    def states(self) -> int:
+        """The membrane."""
+        return len(LeakyLayer.STATE)
+
 
 class LeakyLayer(NeuronLayer):
     """IF or LIF neurons over T steps.

@@ -20,6 +20,11 @@ class ReLUNode(NeuronNode):
         """``relu``."""
         return "relu"
 
+    @property
+    def states(self) -> int:
+        """None."""
+        return 0
+
 
 class ReLULayer(NeuronLayer):
     """Activations ``max(I, 0)``."""

@@ -48,6 +48,11 @@ class SynapticNode(NeuronNode):
         """``Synaptic``."""
         return "Synaptic"
 
+    @property
+    def states(self) -> int:
+        """The synaptic current and the membrane."""
+        return len(SynapticLayer.STATE)
+
 
 class SynapticLayer(NeuronLayer):
     """Current-based leaky neurons over T steps.
