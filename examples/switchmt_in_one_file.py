@@ -6,8 +6,8 @@ SwitchMT, DAC 2026). Read it beside the paper: the comments name its equations a
     python examples/switchmt_in_one_file.py                 # about a minute on one core
     python examples/switchmt_in_one_file.py --steps 500     # a glance
 
-The two games, Catch and Dodge, show the same images and want opposite actions. Without dendrites a network cannot tell
-them apart (try --no-dendrites). tests/examples/test_one_file.py holds the package's network, target and switching
+The two games, Catch and Dodge, show the same images and want opposite actions. Without dendrites a network cannot solve
+both (try --no-dendrites). tests/examples/test_one_file.py holds the package's network, target and switching
 decisions against this file.
 
 Shapes: T simulation steps, B batch, C channels, N neurons, S dendritic segments, K tasks, A actions.
@@ -224,7 +224,7 @@ def train(args: argparse.Namespace, environments: list[gymnasium.Env]) -> Spikin
     shape, num_tasks = (1, 6, 5), len(environments)
     q = SpikingQNetwork(shape, 3, num_tasks, args.hidden, 3 if args.dendrites else 0)  # 2: Q
     q_star = copy.deepcopy(q).eval()  # 2: Q*
-    optimizer = torch.optim.Adam(q.parameters(), lr=1e-3)
+    optimizer = torch.optim.Adam(q.parameters(), lr=3e-3)
     replays = [Replay(10_000, shape) for _ in environments]  # 3: D_j
     i, policy = 0, ParameterChange(args.window)  # 4
     for environment in environments:
@@ -237,11 +237,12 @@ def train(args: argparse.Namespace, environments: list[gymnasium.Env]) -> Spikin
         image, reward, terminal, _, _ = environments[i].step(action)  # 8
         next_state = channels_first(image)
         replays[i].add(state, action, reward, next_state, terminal)  # 9
-        if t % 4 == 0 and replays[i].added >= args.batch_size:
-            loss = loss_on(replays[i].sample(args.batch_size, rng), q, q_star, i, discount=0.9)  # 10, 11
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()  # 12
+        for k in [i] if args.current_only else range(num_tasks):  # the paper samples D_i, its authors' script every D_j
+            if t % 4 == 0 and replays[k].added >= args.batch_size:
+                loss = loss_on(replays[k].sample(args.batch_size, rng), q, q_star, k, discount=0.9)  # 10, 11
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()  # 12
         state, steps_in_visit = next_state, steps_in_visit + 1
         if terminal:  # 13
             returns = [*returns, reward]
@@ -250,7 +251,7 @@ def train(args: argparse.Namespace, environments: list[gymnasium.Env]) -> Spikin
                 print(f"step {t:6}  leaves {name:5}  mean return of the visit {np.mean(returns):+.2f}")
                 i, policy, steps_in_visit, returns = (i + 1) % num_tasks, ParameterChange(args.window), 0, []  # 20
             state = channels_first(environments[i].reset()[0])
-        if t % 200 == 0:  # 23
+        if t % 100 == 0:  # 23
             q_star.load_state_dict(q.state_dict())  # 24
     return q
 
@@ -273,7 +274,8 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--hidden", type=int, default=64, help="units of each stream")
     parser.add_argument("--batch-size", type=int, default=32)
     parser.add_argument("--window", type=int, default=5, help="K of Eq. 3, in episodes")
-    parser.add_argument("--min-stay", type=int, default=300, help="shortest visit, in steps")
+    parser.add_argument("--min-stay", type=int, default=100, help="shortest visit, in steps")
+    parser.add_argument("--current-only", action="store_true", help="learn from the current task's buffer only")
     parser.add_argument("--dendrites", action=argparse.BooleanOptionalAction, default=True)
     return parser.parse_args(words)
 

@@ -126,6 +126,6 @@ def test_switching_decisions_equal_the_one_file_decisions(seed: int) -> None:
 
 
 def test_one_file_runs_from_the_command_line_arguments() -> None:
-    scores = one_file.main(["--steps", "400", "--min-stay", "50", "--hidden", "8"])
+    scores = one_file.main(["--steps", "400", "--hidden", "8"])
     assert set(scores) == {"Catch", "Dodge"}
     assert all(-1.0 <= score <= 1.0 for score in scores.values())
