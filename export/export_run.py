@@ -236,6 +236,15 @@ def load_exported(run: str | Path | None = None, engine: str = "onnx", threads: 
 
     Raises:
         ExportError: the run was not exported.
+
+    Example:
+        >>> import numpy as np
+        >>> from switchmt_snn.export import ExportSettings, export, load_exported
+        >>> exported = export("runs/mine", ExportSettings(onnx=True, parity_decisions=8))
+        >>> agent = load_exported("runs/mine")
+        >>> observations = np.zeros((5, *agent.suite.observation_shape), np.float32)
+        >>> agent.q_values(observations, task=0).shape
+        (5, 3)
     """
     folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     config = folder.config()

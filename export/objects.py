@@ -43,6 +43,12 @@ def to_onnx(
     Raises:
         ExportError: an ANN has no step, or a weight is not finite.
         TaskError: unknown task.
+
+    Example:
+        >>> from switchmt_snn.export import to_onnx
+        >>> model = to_onnx("runs/mine")
+        >>> [value.name for value in model.graph.input]
+        ['observation', 'task']
     """
     network = _folded(source, int8)
     index = None if task is None else network.task_index(task)
@@ -61,6 +67,12 @@ def to_nir(source: Source, task: str, dialect: NirDialect = "portable", int8: bo
     Raises:
         ExportError: the dialect cannot express the network exactly; the message names one that can.
         TaskError: unknown task.
+
+    Example:
+        >>> from switchmt_snn.export import to_nir
+        >>> graph = to_nir("runs/mine", task="CartPole-v1")
+        >>> type(graph.nodes["input"]).__name__, int(graph.metadata["timesteps"])
+        ('Input', 4)
     """
     network = _folded(source, int8)
     return nir_graph(network, network.task_index(task), dialect)

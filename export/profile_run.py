@@ -77,6 +77,12 @@ def profile(
     Raises:
         ConfigError: fewer than one decision, or a target or chip that does not exist or is wrong.
         ExportError: recorded play that cannot be read or does not fit, or a weight that is not finite.
+
+    Example:
+        >>> from switchmt_snn.export import profile
+        >>> counted = profile("runs/mine", decisions=8, targets=["cmos45-fp32"])
+        >>> [task["task"] for task in counted.facts["tasks"]]
+        ['CartPole-v1', 'Acrobot-v1']
     """
     if not 1 <= decisions <= MAX_DECISIONS:
         raise ConfigError(f"decisions is {decisions}, expected 1 to {MAX_DECISIONS:,}")

@@ -176,6 +176,13 @@ def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
 
     Raises:
         ConfigError: no such chip, or a file that is not one.
+
+    Example:
+        >>> from switchmt_snn.export.folding import fold
+        >>> from switchmt_snn.runs.run import load_agent
+        >>> layers = layer_shapes(fold(load_agent("runs/mine")))
+        >>> check_fit(layers, "loihi-1").fits
+        True
     """
     on = chip if isinstance(chip, Chip) else load_chip(chip)
     fits = [

@@ -72,6 +72,15 @@ class Agent:
         return values[0] if observation.shape == expected else values
 
     def act(self, observation: npt.NDArray[Any], task: str | int) -> Any:
-        """The greedy action (an int) for one observation, or actions ``[B]`` for a batch; see :meth:`q_values`."""
+        """The greedy action (an int) for one observation, or actions ``[B]`` for a batch; see :meth:`q_values`.
+
+        Example:
+            >>> import numpy as np
+            >>> from switchmt_snn import load_agent
+            >>> agent = load_agent("runs/mine")  # the run of train's example
+            >>> observation = np.zeros(agent.suite.observation_shape, np.float32)
+            >>> agent.act(observation, task="CartPole-v1") in (0, 1)
+            True
+        """
         action = self.q_values(observation, task).argmax(axis=-1)
         return int(action) if np.ndim(action) == 0 else action

@@ -20,6 +20,11 @@ def load_config(source: str | Path) -> ExperimentConfig:
 
     Raises:
         ConfigError: no such file or preset, not YAML, or a key or value that the config does not take.
+
+    Example:
+        >>> config = load_config("minatar")
+        >>> config.tasks.names, config.total_steps
+        (('breakout', 'asterix', 'space_invaders'), 600000)
     """
     path = Path(source)
     text = path.read_text(encoding="utf-8") if path.is_file() else _preset_text(path, str(source))

@@ -91,6 +91,15 @@ def train(
 
     Raises:
         SwitchMTError: wrong use (``exit_code`` 2), or a run that failed (``exit_code`` 1).
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from switchmt_snn import load_config, train
+        >>> config = load_config("quickstart")
+        >>> tasks = replace(config.tasks, suite="gym", names=("CartPole-v1", "Acrobot-v1"), frame_stack=1)
+        >>> result = train(replace(config, tasks=tasks, total_steps=300), run="runs/mine")
+        >>> result.status, result.step
+        ('finished', 300)
     """
     group = join_processes()
     try:

@@ -210,17 +210,6 @@ def test_importing_the_package_is_light() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_readme_library_example_runs(tmp_path: Path, monkeypatch) -> None:
-    """The README's Python block, with fewer steps."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert blocks
-    monkeypatch.chdir(tmp_path)
-    for block in blocks:
-        assert "total_steps" in block
-        short = re.sub(r"total_steps=[\d_]+", "total_steps=2_000", block)
-        exec(compile(short, "README.md", "exec"), {"__name__": "readme"})
-
-
 def test_gym_tasks_from_a_file(tmp_path: Path, capsys) -> None:
     """Two Gymnasium ids of different shapes and action counts in one spiking network."""
     path = tmp_path / "two.yaml"

@@ -1,0 +1,112 @@
+"""The fenced blocks of a page, and how each is run.
+
+The conventions are visible to readers:
+
+- ``text`` blocks are output; blocks that set up a virtual environment are run by .ci/run.
+- a block whose first line is ``# NAME.py`` or ``# NAME.yaml`` is saved as that file in the page's folder.
+- ``bash`` blocks are run line by line, ``python`` blocks as scripts, all blocks of a page in order in one folder.
+- a command that ends with ``# tested with OPTIONS`` gets the options, in place of its own; a Python line that ends with
+  ``# tested with NUMBER`` gets the number in place of its last one.
+- a block whose first line is ``# not tested: REASON`` is not run; the test lists it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_FILE = re.compile(r"# ([\w./-]+\.(?:py|yaml))")
+_NOT_TESTED = re.compile(r"# not tested: (.+)")
+_LINKED = ("examples", "configs", "results", "benchmarks", "tests")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block and the line of the page where it starts."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+
+    @property
+    def file_name(self) -> str | None:
+        """The file that the block is, by its first line."""
+        match = _FILE.fullmatch(self.text.splitlines()[0])
+        return match.group(1) if match else None
+
+    @property
+    def not_tested(self) -> str | None:
+        """Why the block is not run, or None."""
+        match = _NOT_TESTED.fullmatch(self.text.splitlines()[0])
+        return match.group(1) if match else None
+
+    def __str__(self) -> str:
+        return f"{self.page}:{self.line}"
+
+
+def blocks(page: str) -> list[Block]:
+    """All fenced blocks of a page of the repository."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return [
+        Block(page, text.count("\n", 0, match.start()) + 1, match.group(1), match.group(2))
+        for match in _BLOCK.finditer(text)
+    ]
+
+
+def shortened(line: str) -> str:
+    """A line with what its ``# tested with`` comment says."""
+    code, mark, instead = line.partition("# tested with ")
+    if not mark:
+        return line
+    if re.fullmatch(r"[\d_]+", instead):
+        return re.sub(r"[\d_]*\d(?=\D*$)", instead, code)
+    for option, value in re.findall(r"(--\S+) (\S+)", instead):
+        code = re.sub(rf"{option} \S+\s*", "", code).rstrip() + f" {option} {value}"
+    return code
+
+
+class Reader:
+    """Someone who follows a page in an empty folder that holds the repository's folders."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in _LINKED:
+            (folder / name).symlink_to(ROOT / name)
+        programs = folder / ".bin"
+        programs.mkdir()
+        command = programs / "switchmt-snn"  # as pip makes it: the current folder is not on the module path by itself
+        command.write_text(f"#!{sys.executable}\nimport sys\nfrom switchmt_snn.cli import main\nsys.exit(main())\n")
+        command.chmod(command.stat().st_mode | stat.S_IEXEC)
+        path = f"{programs}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        self.environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+    def follow(self, block: Block) -> None:
+        """Save or run a block.
+
+        Raises:
+            AssertionError: the block fails, or the conventions do not say what to do with it.
+        """
+        text = "\n".join(map(shortened, block.text.splitlines())).replace(".venv/bin/", "") + "\n"
+        if block.file_name is not None:
+            (self.folder / block.file_name).write_text(text)
+        elif block.language == "bash":
+            for line in text.replace("\\\n", " ").splitlines():
+                self._run(["bash", "-euo", "pipefail", "-c", line], block)
+        elif block.language == "python":
+            script = self.folder / "snippet.py"
+            script.write_text(text)
+            self._run([sys.executable, str(script)], block)
+        else:
+            raise AssertionError(f"{block}: a {block.language or 'plain'} block that is no file and no command")
+
+    def _run(self, command: list[str], block: Block) -> None:
+        done = subprocess.run(command, cwd=self.folder, env=self.environment, capture_output=True, text=True)
+        assert done.returncode == 0, f"{block}\n{command[-1]}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"

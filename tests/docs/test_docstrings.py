@@ -1,0 +1,52 @@
+"""Examples in docstrings run, in one folder and in this order: later ones read the run of the second."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.config import load_config
+from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
+from switchmt_snn.export.chips.fit import check_fit
+from switchmt_snn.replay.ring import FrameReplay
+from switchmt_snn.runs.run import train
+
+EXAMPLES: tuple[Any, ...] = (
+    load_config,
+    train,
+    Agent.act,
+    FrameReplay,
+    to_onnx,
+    to_nir,
+    load_exported,
+    profile,
+    check_fit,
+)
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.slow
+def test_examples_in_docstrings_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for part in EXAMPLES:
+        names = dict(vars(inspect.getmodule(part)))  # an example may use what its module imports
+        (test,) = doctest.DocTestFinder(recurse=False).find(part, part.__qualname__, globs=names)
+        assert test.examples, f"{part.__qualname__} has no example"
+        failures = doctest.DocTestRunner().run(test).failed
+        assert failures == 0, f"the example of {part.__qualname__} fails; its output is above"
+
+
+def test_every_example_of_a_docstring_is_in_the_list() -> None:
+    with_examples = {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("switchmt_snn", "export")
+        for path in (ROOT / folder).rglob("*.py")
+        if ">>> " in path.read_text()
+    }
+    listed = {Path(inspect.getsourcefile(part)).resolve().relative_to(ROOT).as_posix() for part in EXAMPLES}
+    assert with_examples == listed
