@@ -3,7 +3,8 @@
 The conventions are visible to readers:
 
 - ``text`` blocks are output; blocks that set up a virtual environment are run by .ci/run.
-- a block whose first line is ``# NAME.py`` or ``# NAME.yaml`` is saved as that file in the page's folder.
+- a block whose first line is ``# NAME.py`` or ``# NAME.yaml`` is saved as that file in the page's folder; a script
+  ``train_*.py`` is then run.
 - ``bash`` blocks are run line by line, ``python`` blocks as scripts, all blocks of a page in order in one folder.
 - a command that ends with ``# tested with OPTIONS`` gets the options, in place of its own; a Python line that ends with
   ``# tested with NUMBER`` gets the number in place of its last one.
@@ -97,6 +98,8 @@ class Reader:
         text = "\n".join(map(shortened, block.text.splitlines())).replace(".venv/bin/", "") + "\n"
         if block.file_name is not None:
             (self.folder / block.file_name).write_text(text)
+            if block.file_name.startswith("train_"):
+                self._run([sys.executable, block.file_name], block)
         elif block.language == "bash":
             for line in text.replace("\\\n", " ").splitlines():
                 self._run(["bash", "-euo", "pipefail", "-c", line], block)

@@ -13,6 +13,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config
 from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
 from switchmt_snn.export.chips.fit import check_fit
+from switchmt_snn.learning.switching import SwitchingPolicy
 from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.run import train
 
@@ -21,6 +22,7 @@ EXAMPLES: tuple[Any, ...] = (
     train,
     Agent.act,
     FrameReplay,
+    SwitchingPolicy,
     to_onnx,
     to_nir,
     load_exported,

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 SHORT = {
     "01_train_cartpole.py": ["--steps", "700", "--run", "runs/cartpole"],
     "02_own_environment.py": ["--steps", "700"],
+    "03_own_policy.py": ["--steps", "700"],
     "04_own_neuron.py": ["--steps", "600"],
     "05_export_and_act.py": ["--run", "runs/cartpole", "--decisions", "20"],
     "switchmt_in_one_file.py": ["--steps", "200", "--hidden", "8"],
@@ -41,6 +42,7 @@ def test_examples_run_in_order(tmp_path: Path) -> None:
     outputs = {name: run_example(name, tmp_path) for name in SHORT}
     assert "switches:" in outputs["01_train_cartpole.py"]
     assert "Follow-v0: score" in outputs["02_own_environment.py"]
+    assert " -> " in outputs["03_own_policy.py"]
     assert "export: network.neuron is my_neuron:RefractoryIF" in outputs["04_own_neuron.py"]
     assert "the exported file balanced the pole" in outputs["05_export_and_act.py"]
     assert (tmp_path / "runs/cartpole/profile/report.html").is_file()

@@ -35,6 +35,14 @@ class SwitchingPolicy(Stateful):
     """A criterion within bounds: never leaves before the minimal stay, always by the maximal one.
 
     The next task is always ``(i + 1) mod |E|``.
+
+    Example:
+        >>> import torch
+        >>> policy = SwitchingPolicy(SwitchingConfig(policy="fixed_episodes", visit_episodes=1), num_tasks=2)
+        >>> seen = {"task": 0, "episodes_in_visit": 1, "steps_in_visit": 9, "updates": 0, "episode_return": 1.0}
+        >>> record = EpisodeRecord(**seen, parameters=lambda: torch.ones(3))
+        >>> policy.end_of_episode(record).task
+        1
     """
 
     SAVED = ("criterion",)
