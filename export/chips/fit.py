@@ -178,9 +178,9 @@ def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
         ConfigError: no such chip, or a file that is not one.
 
     Example:
-        >>> from switchmt_snn.export.folding import fold
+        >>> from switchmt_snn.export.folded import fold_agent
         >>> from switchmt_snn.runs.run import load_agent
-        >>> layers = layer_shapes(fold(load_agent("runs/mine")))
+        >>> layers = layer_shapes(fold_agent(load_agent("runs/mine")))
         >>> check_fit(layers, "loihi-1").fits
         True
     """
