@@ -113,7 +113,7 @@ def layer_shapes(network: FoldedNetwork) -> tuple[LayerShape, ...]:
                 spiking_input=sees_spikes,
                 input_image=sees if len(sees) == 3 else None,
                 neuron=None if neurons is None else neurons.kind,
-                states=1 if neurons is None else neurons.states,  # the head keeps its sums
+                states=1 if neurons is None else len(neurons.states),  # the head keeps its sums
             )
             for shape in _shapes(node)
         ]

@@ -41,6 +41,7 @@ class LayerProfile:
         weights: its non-zero weights.
         outputs: values that it computes at a step: its neurons, or the head's actions.
         neurons: neurons that it feeds; 0 for the head.
+        states: state variables of one of them; 1 for the head, which adds up.
         spikes_T: spikes of those neurons (for an ANN: activations above zero).
         silent: neurons that never fired.
         saturated: neurons that always fired.
@@ -60,6 +61,7 @@ class LayerProfile:
     weights: int
     outputs: int
     neurons: int
+    states: int
     spikes_T: tuple[int, ...]
     silent: int
     saturated: int
@@ -236,7 +238,12 @@ def _counted(network: FoldedNetwork, node: SynapseNode, task: int) -> CountedSyn
 
 
 def layer_profile(
-    counter: SynapseCounter, neurons: NeuronCounter | None, outputs: int, updates: int, gain_multiplications: int = 0
+    counter: SynapseCounter,
+    neurons: NeuronCounter | None,
+    outputs: int,
+    updates: int,
+    states: int,
+    gain_multiplications: int = 0,
 ) -> LayerProfile:
     """What the two counters of a layer hold.
 
@@ -245,6 +252,7 @@ def layer_profile(
         neurons: of the neurons that they feed; None for a head.
         outputs: values that it computes at a step.
         updates: neuron updates per decision.
+        states: state variables of one neuron.
         gain_multiplications: per decision.
     """
     return LayerProfile(
@@ -259,6 +267,7 @@ def layer_profile(
         weights=int(np.count_nonzero(counter.synapses.node.weight)),
         outputs=outputs,
         neurons=outputs if neurons is not None else 0,
+        states=states,
         spikes_T=tuple(neurons.spikes_TN.sum(axis=1).tolist()) if neurons is not None else (),
         silent=neurons.silent if neurons is not None else 0,
         saturated=neurons.saturated if neurons is not None else 0,
@@ -274,4 +283,5 @@ def _layer_profile(
     steps = network.settings.timesteps
     updates = node.outputs * steps if network.spiking and neurons is not None else 0
     gains = node.outputs * steps if isinstance(node, Dense) and node.gated else 0
-    return layer_profile(counter, neurons, node.outputs, updates, gains)
+    states = next((len(layer.neurons.states) for layer in network.layers if layer.synapses is node), 1)
+    return layer_profile(counter, neurons, node.outputs, updates, states, gains)

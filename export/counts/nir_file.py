@@ -33,7 +33,9 @@ from switchmt_snn.spiking.folding import SPIKE_ENCODINGS
 from switchmt_snn.spiking.layers import Conv, Dense, convolved_sides
 
 _SYNAPTIC = (nir.Conv2d, nir.Affine, nir.Linear)
-_SPIKING = (nir.IF, nir.LIF, nir.Threshold)
+_SPIKING = (nir.IF, nir.LIF, nir.CubaLIF, nir.Threshold)
+_STATES = {nir.IF: 1, nir.LIF: 1, nir.CubaLIF: 2, nir.I: 1, nir.LI: 1}
+"""State variables of one neuron by node."""
 _FACTS = ("encoding", "timesteps", "observation_shape", "frame_stack", "scale")
 """Metadata that encoding raw observations needs."""
 
@@ -105,6 +107,7 @@ class _Layer:
     Attributes:
         source: the node whose output is its input, flat or not.
         spiking: the node that it feeds, with its ``neurons``; None for a head.
+        states: state variables of one neuron, in all nodes between the weights and the spikes.
     """
 
     synapses: SynapseCounter
@@ -112,6 +115,7 @@ class _Layer:
     outputs: int
     spiking: str | None
     neurons: NeuronCounter | None
+    states: int
 
     def add(self, recorded: dict[str, Float]) -> None:
         """Count a batch: outputs ``[T, B, ...]`` by node."""
@@ -122,16 +126,17 @@ class _Layer:
     def profile(self) -> LayerProfile:
         """What has been counted."""
         updates = self.neurons.spikes_TN.size if self.neurons is not None else 0
-        return layer_profile(self.synapses, self.neurons, self.outputs, updates)
+        return layer_profile(self.synapses, self.neurons, self.outputs, updates, self.states)
 
 
 def _layers(interpreter: NirInterpreter, inputs: _Inputs) -> list[_Layer]:
     """The graph's nodes with weights and what each of them feeds, in forward order."""
     nodes = interpreter.graph.nodes
     fed: dict[str, str] = {}
+    states: dict[str, int] = {}
     for name in interpreter.order:
         if isinstance(nodes[name], _SPIKING):
-            weights = _feeding(interpreter, name)
+            weights, states[name] = _feeding(interpreter, name)
             if weights in fed:
                 raise ExportError(
                     f"the NIR node {weights} feeds the spiking nodes {fed[weights]} and {name}, expected one; "
@@ -139,19 +144,22 @@ def _layers(interpreter: NirInterpreter, inputs: _Inputs) -> list[_Layer]:
                 )
             fed[weights] = name
     if not fed:
-        raise ExportError("the NIR graph has no spiking node, expected IF, LIF or Threshold; nothing can be counted")
+        known = ", ".join(kind.__name__ for kind in _SPIKING)
+        raise ExportError(f"the NIR graph has no spiking node, expected one of {known}; nothing can be counted")
     layers = []
     for name in interpreter.order:
         if isinstance(nodes[name], _SYNAPTIC):
             synapses, source = _synapses(interpreter, name, inputs)
             node = synapses.node
             neurons = NeuronCounter(fed[name], node.output_shape, inputs.timesteps) if name in fed else None
-            layers.append(_Layer(SynapseCounter(synapses), source, node.outputs, fed.get(name), neurons))
+            of_each = states[fed[name]] if name in fed else 1
+            layers.append(_Layer(SynapseCounter(synapses), source, node.outputs, fed.get(name), neurons, of_each))
     return layers
 
 
-def _feeding(interpreter: NirInterpreter, spiking: str) -> str:
-    """The node with weights whose output drives a spiking node: the first in forward order, if there are several."""
+def _feeding(interpreter: NirInterpreter, spiking: str) -> tuple[str, int]:
+    """The node with weights whose output drives a spiking node, the first in forward order if several do; and the
+    state variables of one neuron."""
     found: set[str] = set()
     seen, to_do = {spiking}, [spiking]
     while to_do:
@@ -164,7 +172,8 @@ def _feeding(interpreter: NirInterpreter, spiking: str) -> str:
                 to_do.append(source)
     if not found:
         raise ExportError(f"no weights lead to the NIR node {spiking}, expected a Conv2d, Affine or Linear before it")
-    return min(found, key=interpreter.order.index)
+    states = sum(_STATES.get(type(interpreter.graph.nodes[name]), 0) for name in seen)
+    return min(found, key=interpreter.order.index), states
 
 
 def _synapses(interpreter: NirInterpreter, name: str, inputs: _Inputs) -> tuple[CountedSynapses, str]:

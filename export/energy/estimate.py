@@ -190,7 +190,9 @@ def _layer_energy(layer: LayerProfile, spiking: bool, target: Target, unpriced: 
         price = prices.get("ac_conv", prices["ac"]) if layer.convolution else prices["ac"]
         charges = [(layer.effective_per_decision, price, "accumulations")]
     if spiking:
-        charges.append((layer.neuron_updates_per_decision, prices.get("neuron_update"), "neuron updates"))
+        # Targets price the update of a neuron with a membrane and nothing else.
+        update = prices.get("neuron_update") if layer.states == 1 else None
+        charges.append((layer.neuron_updates_per_decision, update, "neuron updates"))
         # A spike has a price of its own on some chips; on the others it is part of what it causes.
         charges.append((layer.spikes_per_decision, prices.get("spike", 0.0), "spikes"))
     unpriced += [f"{count:,.0f} {what} of {layer.name}" for count, price, what in charges if count and price is None]

@@ -42,6 +42,8 @@ def traffic(layer: LayerProfile, spiking: bool) -> Traffic:
         state = 2 * (layer.effective_per_decision + layer.outputs * passes)
     elif spiking:
         state = 2 * layer.neuron_updates_per_decision
+    if spiking:  # what a neuron keeps beyond the variable that its inputs change is read and written once a step
+        state += 2 * max(0, layer.states - 1) * layer.neuron_updates_per_decision
     fires = spiking and layer.neurons > 0
     return Traffic(
         events=(layer.active_inputs_per_decision if accumulates else 0) + (layer.spikes_per_decision if fires else 0),

@@ -10,10 +10,11 @@ Dialects:
   scaled by tau / dt = 1 / (1 - beta) in the weights, because importers ignore or restrict r.
 - ``spikingjelly``: the same for an importer that requires IF.r = 1 / dt, with its default dt = 1e-4.
 - ``exact``: also reset by subtraction, as a loop: an integrator (I, or LI with its own r), a Threshold, and a Scale by
-  minus the threshold back into the integrator, one step later.
+  minus the threshold back into the integrator, one step later. Synaptic neurons have one more LI for their current.
 - ``legacy``: no ``v_reset`` in the file, so that nir <= 1.0.4 reads it; how a spike resets is in the metadata only.
 
-Each node of the network has one rule; a node without a rule is refused by name.
+Each node of the network has one rule; a node without a rule is refused by name. No dialect uses nir.CubaLIF: it resets
+at the spike, while ``snntorch.Synaptic`` resets after the input of the next step.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
 from switchmt_snn.spiking.folding import FoldedNetwork
 from switchmt_snn.spiking.layers import Array, Conv, Dense, Float, Layer, NeuronNode, SynapseNode, no_rule
-from switchmt_snn.spiking.neurons import LeakyNode
+from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, SynapticNode
 
 NirDialect = Literal["portable", "spikingjelly", "exact", "legacy"]
 DIALECT_KEY = "profile"
@@ -153,9 +154,15 @@ def _input_gain_O(neurons: NeuronNode, dialect: str) -> Float:
 
 @_input_gain_O.register
 def _(neurons: LeakyNode, dialect: str) -> Float:
-    if not _decays(neurons) or _needs_loop(neurons, dialect):
+    if not _decays(neurons.beta_O) or _needs_loop(neurons, dialect):
         return np.ones(1, np.float32)
-    return (1.0 / (1.0 - _leak(neurons))).astype(np.float32)
+    return (1.0 / (1.0 - _leak(neurons.beta_O))).astype(np.float32)
+
+
+@_input_gain_O.register(SynapticNode)
+@_input_gain_O.register(AdaptiveNode)
+def _(neurons: NeuronNode, dialect: str) -> Float:
+    return np.ones(1, np.float32)
 
 
 @singledispatch
@@ -166,6 +173,11 @@ def _neurons(neurons: NeuronNode, chain: _Chain, layer: Layer, dialect: str) -> 
 
 @_neurons.register
 def _(neurons: LeakyNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+    if neurons.reset == "subtract" and dialect == "legacy" and _decays(neurons.beta_O):
+        raise ExportError(
+            "LIF neurons reset by subtraction, expected IF for the NIR dialect 'legacy': its importers subtract at the "
+            "spike, before the membrane decays; use --nir-profile exact"
+        )
     if neurons.reset == "subtract" and dialect in ("portable", "spikingjelly"):
         raise ExportError(
             f"the network resets by subtraction, expected reset to zero for the NIR dialect {dialect!r} (that is what "
@@ -177,38 +189,58 @@ def _(neurons: LeakyNode, chain: _Chain, layer: Layer, dialect: str) -> None:
         chain.append(f"{layer.name}_neurons", _leaky(neurons, layer, _DT[dialect]))
 
 
-def _decays(neurons: LeakyNode) -> bool:
-    return bool((neurons.beta_O != 1.0).any())
+@_neurons.register
+def _(neurons: SynapticNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+    if neurons.reset != "subtract" or dialect != "exact":
+        raise ExportError(
+            f"Synaptic neurons reset by {neurons.reset!r} in the NIR dialect {dialect!r}, expected 'subtract' and "
+            "exact: nir.CubaLIF resets at the spike, snnTorch's Synaptic after the next input; use --onnx, or "
+            "network.reset subtract and --nir-profile exact"
+        )
+    chain.append(f"{layer.name}_current", _integrator(layer, neurons.alpha_O, _DT[dialect]))
+    _append_loop(neurons, chain, layer, _DT[dialect])
+
+
+@_neurons.register
+def _(neurons: AdaptiveNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+    raise ExportError("NIR cannot express ALIF: no node has a threshold that changes; use --onnx")
+
+
+def _decays(decay_O: Array) -> bool:
+    return bool((decay_O != 1.0).any())
 
 
 def _needs_loop(neurons: LeakyNode, dialect: str) -> bool:
     return dialect == "exact" and neurons.reset == "subtract"
 
 
-def _leak(neurons: LeakyNode) -> Array:
-    if (neurons.beta_O >= 1.0).any():
-        raise ExportError("a LIF neuron has beta 1 and thus no time constant, expected beta < 1 or network.neuron IF")
-    return neurons.beta_O
+def _leak(decay_O: Array) -> Array:
+    if (decay_O >= 1.0).any():
+        raise ExportError("some of a layer's neurons have a decay of 1 and thus no time constant, expected all or none")
+    return decay_O
 
 
 def _leaky(neurons: LeakyNode, layer: Layer, dt: float) -> nir.NIRNode:
     """IF or LIF with parameters of the layer's full shape (importers do not broadcast)."""
     threshold, zero = _full(layer, neurons.threshold_O), _full(layer, 0.0)
-    if not _decays(neurons):
+    if not _decays(neurons.beta_O):
         return nir.IF(r=_full(layer, 1.0 / dt), v_threshold=threshold, v_reset=zero)
-    tau = _full(layer, dt / (1.0 - _leak(neurons)))
+    tau = _full(layer, dt / (1.0 - _leak(neurons.beta_O)))
     return nir.LIF(tau=tau, r=_full(layer, 1.0), v_leak=zero, v_threshold=threshold, v_reset=zero.copy())
 
 
-def _append_loop(neurons: LeakyNode, chain: _Chain, layer: Layer, dt: float) -> None:
+def _integrator(layer: Layer, decay_O: Array, dt: float) -> nir.NIRNode:
+    """``v(t) = decay v(t-1) + x(t)``."""
+    if not _decays(decay_O):
+        return nir.I(r=_full(layer, 1.0 / dt))
+    tau = dt / (1.0 - _leak(decay_O))
+    return nir.LI(tau=_full(layer, tau), r=_full(layer, tau / dt), v_leak=_full(layer, 0.0))
+
+
+def _append_loop(neurons: LeakyNode | SynapticNode, chain: _Chain, layer: Layer, dt: float) -> None:
     """``U(t) = beta U(t-1) + I(t) - threshold S(t-1)``; the Threshold carries the layer's neuron name."""
     membrane, reset = f"{layer.name}_membrane", f"{layer.name}_reset"
-    if _decays(neurons):
-        tau = dt / (1.0 - _leak(neurons))
-        node = nir.LI(tau=_full(layer, tau), r=_full(layer, tau / dt), v_leak=_full(layer, 0.0))
-    else:
-        node = nir.I(r=_full(layer, 1.0 / dt))
-    chain.append(membrane, node)
+    chain.append(membrane, _integrator(layer, neurons.beta_O, dt))
     chain.append(f"{layer.name}_neurons", nir.Threshold(threshold=_full(layer, neurons.threshold_O)))
     chain.nodes[reset] = nir.Scale(scale=_full(layer, -neurons.threshold_O))
     chain.edges += [(chain.last, reset), (reset, membrane)]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from switchmt_snn.export.formats.onnx_graph import FLOAT, Graph
 from switchmt_snn.spiking.layers import Array, Conv, Dense, Layer, NeuronNode, SynapseNode, no_rule
-from switchmt_snn.spiking.neurons import LeakyNode, ReLUNode
+from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, ReLUNode, SynapticNode
 
 _REMEDY = "add a rule to export/formats/onnx_nodes.py"
 
@@ -112,22 +112,6 @@ def _(node: Dense, graph: Graph, current: str) -> str:
     return graph.add("Flatten", [kept], f"{name}_current", axis=1)
 
 
-@singledispatch
-def states_of(neurons: NeuronNode) -> tuple[str, ...]:
-    """Names of the neurons' state variables; in a graph each is ``<state>_<layer>``, zero at rest."""
-    raise no_rule("ONNX", neurons, states_of.registry, _REMEDY)
-
-
-@states_of.register
-def _(neurons: ReLUNode) -> tuple[str, ...]:
-    return ()
-
-
-@states_of.register
-def _(neurons: LeakyNode) -> tuple[str, ...]:
-    return ("membrane",)
-
-
 def fire(graph: Graph, layer: Layer, current: str) -> str:
     """One step of a layer's neurons: each ``<state>_<layer>`` becomes ``<state>_<layer>_next``; returns the spikes."""
     return _step(layer.neurons, graph, layer, current)
@@ -160,8 +144,63 @@ def _(neurons: LeakyNode, graph: Graph, layer: Layer, current: str) -> str:
         u = graph.add("Add", [u, current], f"{name}_charged")
         amount = graph.add("Where", [owed, threshold, graph.constant("zero", 0.0)], f"{name}_reset_by")
         graph.add("Sub", [u, amount], following)
-    fired = graph.add("Greater", [following, threshold], f"{name}_fired")
-    return graph.add("Cast", [fired], f"spikes_{name}", to=FLOAT)
+    return _compared(graph, layer, following, threshold)
+
+
+@_step.register
+def _(neurons: SynapticNode, graph: Graph, layer: Layer, current: str) -> str:
+    name = layer.name
+    threshold, beta, alpha = (
+        graph.constant(f"{name}_{of}", _by_channel(layer, values_O))
+        for of, values_O in (("threshold", neurons.threshold_O), ("beta", neurons.beta_O), ("alpha", neurons.alpha_O))
+    )
+    u, following = f"membrane_{name}", f"membrane_{name}_next"
+    owed = graph.add("Greater", [u, threshold], f"{name}_reset_owed")
+    kept = graph.add("Mul", [f"current_{name}", alpha], f"{name}_current_decayed")
+    synaptic = graph.add("Add", [kept, current], f"current_{name}_next")
+    charged = graph.add("Add", [graph.add("Mul", [u, beta], f"{name}_decayed"), synaptic], f"{name}_charged")
+    zero = graph.constant("zero", 0.0)
+    if neurons.reset == "zero":
+        graph.add("Where", [owed, zero, charged], following)
+    else:
+        graph.add("Sub", [charged, graph.add("Where", [owed, threshold, zero], f"{name}_reset_by")], following)
+    return _compared(graph, layer, following, threshold)
+
+
+@_step.register
+def _(neurons: AdaptiveNode, graph: Graph, layer: Layer, current: str) -> str:
+    name = layer.name
+    rest, beta, decay, strength = (
+        graph.constant(f"{name}_{of}", _by_channel(layer, values_O))
+        for of, values_O in (
+            ("threshold", neurons.threshold_O),
+            ("beta", neurons.beta_O),
+            ("adaptation_decay", neurons.adaptation_decay_O),
+            ("adaptation_strength", neurons.adaptation_strength_O),
+        )
+    )
+    u, following = f"membrane_{name}", f"membrane_{name}_next"
+    a, adapted = f"threshold_adaptation_{name}", f"threshold_adaptation_{name}_next"
+    rise = graph.add("Mul", [a, strength], f"{name}_rise")
+    crossed = graph.add("Add", [rest, rise], f"{name}_crossed")
+    spiked = graph.add("Greater", [u, crossed], f"{name}_reset_owed")
+    zero = graph.constant("zero", 0.0)
+    if neurons.reset == "zero":
+        u = graph.add("Where", [spiked, zero, u], f"{name}_after_reset")
+        graph.add("Add", [graph.add("Mul", [u, beta], f"{name}_decayed"), current], following)
+    else:
+        charged = graph.add("Add", [graph.add("Mul", [u, beta], f"{name}_decayed"), current], f"{name}_charged")
+        graph.add("Sub", [charged, graph.add("Where", [spiked, crossed, zero], f"{name}_reset_by")], following)
+    jump = graph.add("Cast", [spiked], f"{name}_jump", to=FLOAT)
+    graph.add("Add", [graph.add("Mul", [a, decay], f"{name}_adaptation_decayed"), jump], adapted)
+    risen = graph.add("Mul", [adapted, strength], f"{name}_next_rise")
+    return _compared(graph, layer, following, graph.add("Add", [rest, risen], f"{name}_next_threshold"))
+
+
+def _compared(graph: Graph, layer: Layer, membrane: str, threshold: str) -> str:
+    """The spikes: where the membrane is strictly above the threshold."""
+    fired = graph.add("Greater", [membrane, threshold], f"{layer.name}_fired")
+    return graph.add("Cast", [fired], f"spikes_{layer.name}", to=FLOAT)
 
 
 def _by_channel(layer: Layer, values_O: Array) -> Array:

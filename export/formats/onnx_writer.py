@@ -22,7 +22,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
 from switchmt_snn.export.formats.onnx_encodings import encode, observation_input
 from switchmt_snn.export.formats.onnx_graph import FLOAT, INT64, Graph
-from switchmt_snn.export.formats.onnx_nodes import Weights, current_of, fire, states_of, weights_of
+from switchmt_snn.export.formats.onnx_nodes import Weights, current_of, fire, weights_of
 from switchmt_snn.spiking.folding import FoldedNetwork
 
 OPSET = 18
@@ -80,7 +80,7 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
     x = "encoded"
     for layer in network.layers:
         shape: list[str | int | None] = ["batch", *layer.output_shape]
-        states = [f"{state}_{layer.name}" for state in states_of(layer.neurons)]
+        states = [f"{state}_{layer.name}" for state in layer.neurons.states]
         inputs += [helper.make_tensor_value_info(state, FLOAT, shape) for state in states]
         given = [f"spikes_{layer.name}", *(f"{state}_next" for state in states)]
         outputs += [helper.make_tensor_value_info(name, FLOAT, shape) for name in given]
@@ -130,7 +130,7 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
         counts.append(body.add("Unsqueeze", [total, graph.constant("axis_1", [1], np.int64)], f"{layer.name}_count"))
     step_counts = body.add("Concat", counts, "step_counts", axis=1)
     body.add("Add", ["counts", step_counts], "counts_next")
-    states = {f"{state}_{layer.name}": layer.output_shape for layer in layers for state in states_of(layer.neurons)}
+    states = {f"{state}_{layer.name}": layer.output_shape for layer in layers for state in layer.neurons.states}
     states["counts"] = (len(layers),)
     if readout.kind == "mean":
         states["spike_sum"] = network.head.input_shape

@@ -18,7 +18,6 @@ import numpy.typing as npt
 import onnxruntime
 
 from switchmt_snn.acting.agent import Agent
-from switchmt_snn.export.formats.onnx_nodes import states_of
 from switchmt_snn.export.parity.activity import active_neurons, chunks
 from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, existing_only, onnx_session
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
@@ -153,7 +152,7 @@ def trace_onnx(
     if step is None:
         return Trace(decided["q_values"], {}, counts)
     shapes = {
-        f"{state}_{layer.name}": (batch, *layer.output_shape) for layer in layers for state in states_of(layer.neurons)
+        f"{state}_{layer.name}": (batch, *layer.output_shape) for layer in layers for state in layer.neurons.states
     }
     states = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     spikes: dict[str, list[npt.NDArray[np.bool_]]] = {layer.name: [] for layer in layers}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from functools import singledispatch
 from typing import Any, cast
 
 import numpy as np
@@ -17,12 +18,13 @@ import torch
 from torch import Tensor, nn
 
 from switchmt_snn.acting.agent import Agent
+from switchmt_snn.errors import ExportError
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import encode
 from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.network import Stream
-from switchmt_snn.spiking.neurons import LeakyLayer
+from switchmt_snn.spiking.neurons import AdaptiveLayer, LeakyLayer, NeuronLayer, ReLULayer, SynapticLayer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 _DYADIC_BETAS = (0.0, 0.5, 0.75, 0.875)
@@ -75,10 +77,8 @@ def dyadic_copy(agent: Agent, weight_bits: int = 5) -> Agent:
                 _round_normalization(module, network.spiking)
             elif isinstance(module, ActiveDendrites):
                 _round_dendrites(module)
-            elif isinstance(module, LeakyLayer):
-                module.leaky.threshold.copy_(_to_grid(module.leaky.threshold, 3).clamp(min=0.125))
-                if float(module.leaky.beta) != 1.0:
-                    module.leaky.beta.fill_(min(_DYADIC_BETAS, key=lambda beta: abs(beta - float(module.leaky.beta))))
+            elif isinstance(module, NeuronLayer):
+                _round_neurons(module)
         if "advantage" in network.streams:
             _center(cast(Stream, network.streams["advantage"]).head)
     scale = agent.suite.scale if math.log2(agent.suite.scale).is_integer() else 2.0**-8
@@ -108,7 +108,7 @@ def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]
                 break
             with torch.no_grad():
                 for name in names:
-                    cast(Any, layers[name]).neurons.leaky.threshold.div_(2.0)
+                    _threshold(cast(Any, layers[name]).neurons).div_(2.0)
 
 
 def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any], seed: int = 0) -> bool:
@@ -120,8 +120,10 @@ def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any], seed: int 
     # snnTorch's neurons write into themselves; copies keep calls from several threads apart.
     same_bits, wide = copy.deepcopy(agent.network), copy.deepcopy(agent.network).double()
     for module in wide.modules():
-        if isinstance(module, LeakyLayer):
-            module.surrogate = module.leaky.spike_grad = _step  # snnTorch's surrogates answer in float32
+        if isinstance(module, NeuronLayer):
+            module.surrogate = _step  # snnTorch's surrogates answer in float32
+            for neuron in module.children():
+                neuron.spike_grad = _step  # type: ignore[assignment]
     scaled = torch.from_numpy(encode(agent.suite, agent.config, observations, seed).copy())
     narrow_activity: dict[str, torch.Tensor] = {}
     wide_activity: dict[str, torch.Tensor] = {}
@@ -161,6 +163,71 @@ def dyadic_observations(observations: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def _to_grid(value: Tensor, bits: int) -> Tensor:
     return torch.round(value * 2.0**bits) / 2.0**bits
+
+
+def _dyadic_decay(value: Tensor | float) -> float:
+    return min(_DYADIC_BETAS, key=lambda decay: abs(decay - float(value)))
+
+
+@singledispatch
+def _round_neurons(layer: NeuronLayer) -> None:
+    """Make a layer's parameters dyadic; a membrane that does not decay stays so."""
+    raise ExportError(
+        f"the dyadic copy cannot express {type(layer).__name__}, expected a registered neuron model; add a rule to "
+        "export/parity/dyadic.py"
+    )
+
+
+@_round_neurons.register
+def _(layer: ReLULayer) -> None:
+    pass
+
+
+@_round_neurons.register
+def _(layer: LeakyLayer) -> None:
+    _round_threshold(layer)
+    if float(layer.leaky.beta) != 1.0:
+        layer.leaky.beta.fill_(_dyadic_decay(layer.leaky.beta))
+
+
+@_round_neurons.register
+def _(layer: SynapticLayer) -> None:
+    _round_threshold(layer)
+    layer.synaptic.alpha.fill_(_dyadic_decay(layer.synaptic.alpha))
+    layer.synaptic.beta.fill_(_dyadic_decay(layer.synaptic.beta))
+
+
+@_round_neurons.register
+def _(layer: AdaptiveLayer) -> None:
+    _round_threshold(layer)
+    layer.beta.fill_(_dyadic_decay(layer.beta))
+    layer.decay, layer.strength = _dyadic_decay(layer.decay), max(0.125, round(layer.strength * 8) / 8)
+
+
+def _round_threshold(layer: NeuronLayer) -> None:
+    threshold = _threshold(layer)
+    threshold.copy_(_to_grid(threshold, 3).clamp(min=0.125))
+
+
+@singledispatch
+def _threshold(layer: NeuronLayer) -> Tensor:
+    """The threshold (at rest) of a layer's neurons, to be changed in place."""
+    raise ExportError(f"{type(layer).__name__} has no threshold, expected a spiking neuron model")
+
+
+@_threshold.register
+def _(layer: LeakyLayer) -> Tensor:
+    return cast(Tensor, layer.leaky.threshold)
+
+
+@_threshold.register
+def _(layer: SynapticLayer) -> Tensor:
+    return cast(Tensor, layer.synaptic.threshold)
+
+
+@_threshold.register
+def _(layer: AdaptiveLayer) -> Tensor:
+    return layer.threshold
 
 
 def _round_synapses(module: nn.Conv2d | nn.Linear, spiking: bool, bits: int) -> None:

@@ -19,7 +19,7 @@ from switchmt_snn.export.parity.compare import MIN_EQUAL_ACTIONS, Comparison, Ex
 from switchmt_snn.export.parity.dyadic import dyadic_observations, exact_copy
 from switchmt_snn.export.runtimes.agents import OnnxAgent, encode
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
-from switchmt_snn.export.runtimes.simulators import SIMULATORS, quietly, simulate
+from switchmt_snn.export.runtimes.simulators import SIMULATORS, quietly, simulate, skipped
 from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.spiking.folding import FoldedNetwork
 
@@ -77,11 +77,16 @@ class _Proof:
                         f"{name}, {comparison.engine}: not bitwise equal on exact numbers, first in layer "
                         f"{comparison.first_difference}"
                     )
-        simulators = self._simulators(twin, copied.graphs, exact_inputs) if copied.graphs is not None else []
+        simulators, left_out = [], {}
+        if copied.graphs is not None:
+            simulators = self._simulators(twin, copied.graphs, exact_inputs)
+            first = next(iter(copied.graphs.values()))
+            left_out = {name: reason for name in SIMULATORS if (reason := skipped(name, first)) is not None}
         return {
             "dyadic": dyadic,
             "recorded": real,
             "simulators": simulators,
+            "simulators_skipped": left_out,
             "int8_storage": stored,
             "criteria": {"dyadic": "bitwise", "recorded_min_equal_actions": MIN_EQUAL_ACTIONS},
             "failures": self.failures,
@@ -126,14 +131,7 @@ class _Proof:
         self, twin: Agent, graphs: dict[str, nir.NIRGraph], exact_inputs: list[Observations]
     ) -> list[dict[str, Any]]:
         """Every installed simulator on the dyadic graphs, against the interpreter under the same convention."""
-        metadata = next(iter(graphs.values())).metadata
-        if dialect_of(next(iter(graphs.values()))) in ("exact", "legacy") or twin.config.network.neuron != "IF":
-            return []  # loops, and files for older readers, are not what these importers take
-        names = [
-            name
-            for name, simulator in SIMULATORS.items()
-            if simulator.installed and (name not in ("norse", "nirtorch") or float(metadata["dt"]) == 1.0)
-        ]
+        names = [name for name in SIMULATORS if skipped(name, next(iter(graphs.values()))) is None]
 
         def simulated(task: str, name: str) -> dict[str, Any]:
             simulator, recorded = SIMULATORS[name], exact_inputs[twin.suite.index(task)]

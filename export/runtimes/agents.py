@@ -22,7 +22,7 @@ from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.spiking.encodings import Encoder
-from switchmt_snn.spiking.layers import Readout
+from switchmt_snn.spiking.layers import ReadoutNode
 from switchmt_snn.tasks.suite import TaskSuite
 
 Observations = npt.NDArray[Any]
@@ -166,7 +166,7 @@ class NirAgent:
         encoded = encode(self.suite, self.config, observation, self._generator)
         outputs, _ = self.interpreters[self.suite.names[index]].run(encoded)
         settings = self.config.network
-        q_BA = Readout(settings.readout, settings.readout_beta)(outputs)
+        q_BA = ReadoutNode(settings.readout, settings.readout_beta)(outputs)
         return existing_only(q_BA, self.suite.valid_actions_KA[index])
 
 

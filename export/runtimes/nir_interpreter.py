@@ -27,7 +27,8 @@ class NirInterpreter:
     """A NIR graph that runs.
 
     Args:
-        graph: one Input, one Output; nodes Conv2d, Affine, Linear, Flatten, IF, LIF, I, LI, Threshold, Scale.
+        graph: one Input, one Output; nodes Conv2d, Affine, Linear, Flatten, IF, LIF, CubaLIF, I, LI, Threshold,
+            Scale.
         dt: length of a simulation step; None takes it from the graph's metadata.
         reset: what a spike does to the membrane of IF and LIF nodes: ``zero`` (to v_reset, as NIR defines it) or
             ``subtract`` (the threshold, as sinabs does).
@@ -126,6 +127,8 @@ class NirInterpreter:
             return lambda x: cast(Float, x * node.scale)
         if isinstance(node, nir.Threshold):
             return lambda x: self._fires(x, node.threshold).astype(np.float32)
+        if isinstance(node, nir.CubaLIF):
+            return _Cuba(node, self.dt, self.reset, self._fires, self.floor)
         return _Membrane(node, self.dt, self.reset, self._fires, self.floor)
 
 
@@ -141,7 +144,7 @@ def _once(stateless: Step) -> Step:
     return step
 
 
-_KNOWN = ("Conv2d", "Affine", "Linear", "Flatten", "IF", "LIF", "I", "LI", "Threshold", "Scale")
+_KNOWN = ("Conv2d", "Affine", "Linear", "Flatten", "IF", "LIF", "CubaLIF", "I", "LI", "Threshold", "Scale")
 
 
 class _Membrane:
@@ -168,6 +171,24 @@ class _Membrane:
         v = np.where(fired, after, v)
         self.v = np.maximum(v, -self.node.v_threshold) if self.floor else v
         return cast(Float, fired.astype(np.float32))
+
+
+class _Cuba:
+    """CubaLIF: tau_syn I' = w_in x - I, then the LIF that I drives, which sees I of the same step."""
+
+    def __init__(self, node: nir.CubaLIF, dt: float, reset: str, fires: Callable[..., Any], floor: bool) -> None:
+        self.weight, rate = node.w_in, dt / node.tau_syn.astype(np.float64)
+        self.rate = rate.astype(np.float32)
+        driven = nir.LIF(
+            tau=node.tau_mem, r=node.r, v_leak=node.v_leak, v_threshold=node.v_threshold, v_reset=node.v_reset
+        )
+        self.membrane = _Membrane(driven, dt, reset, fires, floor)
+        self.current: Float | None = None
+
+    def __call__(self, x: Float) -> Float:
+        current = np.zeros_like(x) if self.current is None else self.current
+        self.current = current + self.rate * (self.weight * x - current)
+        return self.membrane(self.current)
 
 
 def _convolve(x: Float, node: nir.Conv2d, stride: Pair, padding: Pair) -> Float:

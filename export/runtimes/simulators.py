@@ -113,6 +113,24 @@ SIMULATORS: dict[str, Simulator] = {
 """Simulators that are known to read the portable profile."""
 
 
+_COMPARED = (nir.Input, nir.Conv2d, nir.IF, nir.Flatten, nir.Affine, nir.Output)
+"""Nodes on which the importers agree with NIR up to the conventions above."""
+
+
+def skipped(name: str, graph: nir.NIRGraph) -> str | None:
+    """Why a simulator is not compared on a graph; None if it is."""
+    if not SIMULATORS[name].installed:
+        return f"{', '.join(SIMULATORS[name].modules)} not installed"
+    if str(graph.metadata["profile"]) in ("exact", "legacy"):
+        return f"does not take the dialect {graph.metadata['profile']}"
+    others = sorted({type(node).__name__ for node in graph.nodes.values() if not isinstance(node, _COMPARED)})
+    if others:
+        return f"importers differ in what {', '.join(others)} means"
+    if name in ("norse", "nirtorch") and float(graph.metadata["dt"]) != 1.0:
+        return f"takes dt 1, not {graph.metadata['dt']}"
+    return None
+
+
 def simulate(name: str, graph: nir.NIRGraph, inputs_TB: Float) -> Float:
     """Outputs ``[T, B, ...]`` of a graph in a simulator, on encoded inputs ``[T, B, ...]``."""
     return SIMULATORS[name].run(graph, np.ascontiguousarray(inputs_TB), float(graph.metadata["dt"]))

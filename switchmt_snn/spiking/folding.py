@@ -32,7 +32,7 @@ from switchmt_snn.spiking.layers import (
     Layer,
     NeuronNode,
     Pair,
-    Readout,
+    ReadoutNode,
     SynapseNode,
     convolved_sides,
     side_by_side,
@@ -80,7 +80,7 @@ class FoldedNetwork:
 
     layers: tuple[Layer, ...]
     head: Dense
-    readout: Readout
+    readout: ReadoutNode
     settings: NetworkConfig
     observation: ObservationSpec
     observation_dtype: npt.DTypeLike
@@ -162,7 +162,7 @@ def fold(
     return FoldedNetwork(
         layers=(*nodes.trunk, hidden),
         head=head,
-        readout=Readout(network.config.readout, network.config.readout_beta),
+        readout=ReadoutNode(network.config.readout, network.config.readout_beta),
         settings=network.config,
         observation=seen,
         observation_dtype=observation_dtype,

@@ -1,12 +1,12 @@
 """The description of a network: one small class per node. Every reader (ONNX, NIR, counting, chips) dispatches on them.
 
-=========  ===========================================================================================
-node       equation
-=========  ===========================================================================================
-Conv       ``current = scale_KO[k] * (W * x) + shift_KO[k]``, ``*`` the cross-correlation of images
-Dense      ``current = scale_KO[k] * (W x) + shift_KO[k]``, then k winners per group if it has them
-Readout    Q-values from the head's outputs at the T steps
-=========  ===========================================================================================
+===========  =========================================================================================
+node         equation
+===========  =========================================================================================
+Conv         ``current = scale_KO[k] * (W * x) + shift_KO[k]``, ``*`` the cross-correlation of images
+Dense        ``current = scale_KO[k] * (W x) + shift_KO[k]``, then k winners per group if it has them
+ReadoutNode  Q-values from the head's outputs at the T steps
+===========  =========================================================================================
 
 The neuron models describe themselves as subclasses of :class:`NeuronNode`. A reader is a ``functools.singledispatch``
 function over these classes. Its default raises :class:`ExportError` with the node's name, so a reader never treats a
@@ -159,7 +159,7 @@ class Dense(SynapseNode):
 
 
 @dataclass(frozen=True)
-class Readout:
+class ReadoutNode:
     """Q-values from the head's outputs ``y(1) ... y(T)``.
 
     ============  ===========================================================
@@ -211,9 +211,9 @@ class NeuronNode:
         raise NotImplementedError(f"{type(self).__name__} has no kind, expected a name")
 
     @property
-    def states(self) -> int:
-        """State variables of one neuron: its membrane, and what else it keeps from step to step."""
-        raise ExportError(f"{type(self).__name__} does not say how many states it has, expected a property 'states'")
+    def states(self) -> tuple[str, ...]:
+        """Names of a neuron's state variables: its membrane, and what else it keeps from step to step."""
+        raise ExportError(f"{type(self).__name__} does not name its states, expected a property 'states'")
 
     def facts(self) -> dict[str, Any]:
         """Plain values of all parameters; one number where all channels share it."""

@@ -163,8 +163,8 @@ def test_adaptive_neurons_are_held_only_where_neurons_are_programs() -> None:
 
 def test_a_neuron_class_of_ones_own_is_not_held_until_a_chip_lists_it() -> None:
     """Its kind is its name in a config; a chip's file may list that name."""
-    node = OpaqueNode("my_module:MyNeuron", 3)
-    layer = LayerShape("dense", (4,), (2,), None, 1, 8, True, node.kind, states=node.states)
+    node = OpaqueNode("my_module:MyNeuron", ("membrane", "current", "trace"))
+    layer = LayerShape("dense", (4,), (2,), None, 1, 8, True, node.kind, states=len(node.states))
     assert "neuron kind my_module:MyNeuron" in check_fit([layer], "loihi-2").layers[0].not_held
     assert check_fit([layer], chip(neurons=["my_module:MyNeuron"])).fits
 

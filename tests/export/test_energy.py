@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import yaml
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.counts.network import LayerProfile, TaskProfile
 from switchmt_snn.export.energy.estimate import Memory, Target, builtin_targets, estimate, load_target, read_target
+from switchmt_snn.export.energy.traffic import traffic
 from switchmt_snn.export.yaml_files import parse
 from tests.export.export_cases import RunCommand
 
@@ -33,6 +35,7 @@ def layer(name: str, operation: str, effective: int, dense: int, neurons: int, s
         weights=100,
         outputs=neurons or 2,
         neurons=neurons,
+        states=1,
         spikes_T=(spikes // 2,) * 2,
         silent=0,
         saturated=0,
@@ -74,6 +77,17 @@ def test_by_hand() -> None:
     # first layer, which sees numbers.
     assert energy.quantised_ann_pj == pytest.approx(50 * 10 + 36 * 4)
     assert energy.by_quantised_ann == pytest.approx(520 / 644)
+
+
+def test_neurons_of_two_states_have_no_price_but_twice_the_state_traffic() -> None:
+    """A target's price is that of a membrane alone: 8 updates of hidden are named, not priced."""
+    conv, hidden, head = TASK.layers
+    two = replace(TASK, layers=(conv, replace(hidden, states=2), head))
+    energy = estimate(two, target(make()))
+    assert energy.not_included == ("8 neuron updates of hidden",)
+    assert energy.compute_pj == pytest.approx(520 - 8 * 3)
+    extra = traffic(two.layers[1], True).state - traffic(hidden, True).state
+    assert extra == 2 * hidden.neuron_updates_per_decision
 
 
 def test_what_has_no_price_is_named_and_not_guessed() -> None:

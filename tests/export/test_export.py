@@ -25,7 +25,7 @@ from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations, 
 from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session, read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
-from switchmt_snn.spiking.neurons import LeakyLayer
+from switchmt_snn.spiking.neurons import NEURONS, LeakyLayer, NeuronLayer, NeuronState
 from tests.export.export_cases import VARIANTS, make_agent, observations
 
 
@@ -40,7 +40,7 @@ def exports(agent, profile: str | None) -> Exports:
 
 def profile_of(variant: str) -> str | None:
     """The NIR profile that expresses a variant exactly, if there is one."""
-    if variant.startswith("DQN") or variant == "k winners":
+    if variant.startswith(("DQN", "ALIF")) or variant in ("k winners", "Synaptic"):
         return None
     return "exact" if "subtract" in variant else "portable"
 
@@ -76,7 +76,7 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     timesteps=st.sampled_from([1, 2, 4, 8]),
     dendrites=st.sampled_from(["shared", "per_neuron"]),
     encoding=st.sampled_from(["direct", "rate", "latency", "frames", "events"]),
-    neuron=st.sampled_from(["IF", "LIF"]),
+    neuron=st.sampled_from(list(NEURONS)),
     readout=st.sampled_from(["mean", "last_membrane", "max_membrane"]),
     normalization=st.sampled_from(["per_task", "shared"]),
     seed=st.integers(0, 2**20),
@@ -96,8 +96,8 @@ def test_any_network_is_exported_bitwise(
     x = dyadic_observations(observations(agent, 6, seed))
     agent, exact = exact_copy(agent, [x] * 3)
     assert exact
-    profile = None if not traits.spiking else "exact" if reset == "subtract" else "portable"
-    written = exports(agent, profile)
+    profile = "exact" if reset == "subtract" else "portable"
+    written = exports(agent, profile if can_express(fold_agent(agent), profile) else None)
     for task in range(3):
         for comparison in compare(agent, written, task, x):
             assert comparison.bitwise, comparison
@@ -228,7 +228,15 @@ def test_legacy_with_subtract_needs_the_rule_from_the_metadata() -> None:
 
 
 def test_what_nir_cannot_say_is_refused() -> None:
-    for variant, message in (("DQN", "ReLU"), ("k winners", "k_winners"), ("subtract", "--nir-profile exact")):
+    cases = {
+        "DQN": "ReLU",
+        "k winners": "k_winners",
+        "subtract": "--nir-profile exact",
+        "Synaptic": "nir.CubaLIF resets at the spike",
+        "Synaptic subtract": "--nir-profile exact",
+        "ALIF": "NIR cannot express ALIF",
+    }
+    for variant, message in cases.items():
         network = fold_agent(make_agent(**VARIANTS[variant]))
         assert not can_express(network)
         with pytest.raises(ExportError, match=message):
@@ -258,6 +266,40 @@ def test_damaged_and_foreign_files_are_named(tmp_path: Path) -> None:
         onnx_session(path)
 
 
+@pytest.mark.parametrize("neuron", NEURONS)
+def test_every_registered_neuron_is_written_as_onnx_with_all_its_states(neuron: str) -> None:
+    agent = make_agent(neuron=neuron)
+    network = fold_agent(agent)
+    layer = agent.network.trunk["conv1"].neurons
+    assert network.layers[0].neurons.states == layer.STATE
+    inputs = [value.name for value in step_model(network).graph.input]
+    assert inputs == ["encoded", "task", *(f"{state}_{x.name}" for x in network.layers for state in layer.STATE)]
+
+
+def test_a_neuron_from_outside_is_refused_by_every_writer_with_its_name() -> None:
+    agent = make_agent(neuron=f"{__name__}:Unknown")
+    network = fold_agent(agent)
+    for write in (decision_model, step_model, lambda network: nir_graph(network, 0)):
+        with pytest.raises(ExportError, match=rf"cannot express {__name__}:Unknown \(OpaqueNode\), expected"):
+            write(network)
+    with pytest.raises(ExportError, match="dyadic copy cannot express Unknown"):
+        dyadic_copy(agent)
+
+
+class Unknown(NeuronLayer):
+    """Fires whenever its input is positive."""
+
+    def step(self, current_t: torch.Tensor, state: NeuronState) -> tuple[torch.Tensor, NeuronState]:
+        """One step without a state."""
+        return self.surrogate(current_t), state
+
+
+def test_legacy_refuses_leaky_neurons_that_subtract() -> None:
+    network = fold_agent(make_agent(**VARIANTS["LIF subtract"]))
+    with pytest.raises(ExportError, match="before the membrane decays"):
+        nir_graph(network, 0, "legacy")
+
+
 def test_interpreter_by_hand() -> None:
     """One neuron, threshold 1: a tie does not fire under >, and does under >=; the loop subtracts one step later."""
     one = np.ones(1, np.float32)
@@ -281,5 +323,12 @@ def test_interpreter_by_hand() -> None:
     )
     # v += (x - v) / 2 with x = 1.5: 0.75, 1.125 (fires), 0.75, 1.125 (fires).
     assert NirInterpreter(leaky).run(x * 3)[0].ravel().tolist() == [0, 1, 0, 1]
+    two = 2 * one
+    cuba = graph(
+        {"n": nir.CubaLIF(tau_syn=two, tau_mem=two, r=two, v_leak=0 * one, v_threshold=one, w_in=two)},
+        [("input", "n"), ("n", "output")],
+    )
+    # i = i / 2 + x, v = v / 2 + i with x = 0.5: (0.5, 0.5), (0.75, 1.0), (0.875, 1.375: fires), (0.9375, 0.9375).
+    assert NirInterpreter(cuba).run(x)[0].ravel().tolist() == [0, 0, 1, 0]
     with pytest.raises(ExportError, match="has SumPool2d"):
         NirInterpreter(graph({"p": nir.SumPool2d(one, one, one)}, [("input", "p"), ("p", "output")]))

@@ -158,7 +158,7 @@ def exported(tmp_path: Path):
 
 
 OWN = ["DSQN", "DSQN_D", "MTSpark_AD", "SwitchMT", "rate", "latency", "frames", "events", "subtract", "LIF"]
-OWN += ["LIF subtract", "per_neuron", "mlp", "T 7", "T 1", "last_membrane"]
+OWN += ["LIF subtract", "Synaptic subtract", "per_neuron", "mlp", "T 7", "T 1", "last_membrane"]
 
 
 @pytest.mark.parametrize("variant", OWN)
@@ -354,7 +354,9 @@ def test_bad_graphs_are_refused_in_one_line(tmp_path: Path) -> None:
 
     flat = saved(tmp_path / "flat.npz", inputs=np.ones((2, 3, 2), np.float32))
     eye = np.eye(2, dtype=np.float32)
-    refused(written(graph(shapes((2,), (2,), fc=nir.Linear(eye)), dt=1.0)), flat, "has no spiking node, expected IF")
+    refused(
+        written(graph(shapes((2,), (2,), fc=nir.Linear(eye)), dt=1.0)), flat, "has no spiking node, expected one of IF"
+    )
     refused(written(graph(shapes((2,), (2,), n=if_neurons(2)), dt=1.0)), flat, "no weights lead to the NIR node n")
     fork = shapes((2,), (2,), fc=nir.Linear(eye), a=if_neurons(2), b=if_neurons(2))
     edges = [("input", "fc"), ("fc", "a"), ("fc", "b"), ("a", "output"), ("b", "output")]

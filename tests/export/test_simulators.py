@@ -12,7 +12,7 @@ from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations
 from switchmt_snn.export.runtimes.agents import encode, read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
-from switchmt_snn.export.runtimes.simulators import SIMULATORS, simulate
+from switchmt_snn.export.runtimes.simulators import SIMULATORS, simulate, skipped
 from tests.export.export_cases import make_agent, observations
 
 CASES = [(name, "portable") for name in SIMULATORS] + [("spikingjelly", "spikingjelly")]
@@ -34,6 +34,15 @@ def test_simulators_agree_bitwise(name: str, profile: str, method: str, tmp_path
         expected, recorded = NirInterpreter(graph, **simulator.interpreter).run(encoded, ["hidden_neurons"])
         assert recorded["hidden_neurons"].any()
         assert np.array_equal(simulate(name, graph, encoded), expected), simulator.convention
+
+
+def test_a_simulator_that_is_not_compared_says_why() -> None:
+    leaky = nir_graph(fold_agent(make_agent(neuron="LIF")), 0)
+    for name, simulator in SIMULATORS.items():
+        reason = skipped(name, leaky)
+        assert reason == "importers differ in what LIF means" if simulator.installed else reason.endswith("installed")
+    graph = nir_graph(fold_agent(make_agent()), 0, "exact")
+    assert all(skipped(name, graph) is not None for name in SIMULATORS)
 
 
 def test_conventions_differ_where_they_are_said_to() -> None:

@@ -12,7 +12,7 @@ from torch import nn
 from switchmt_snn.config import ExperimentConfig, NetworkConfig, resolve
 from switchmt_snn.errors import ExportError, TaskError
 from switchmt_snn.spiking.folding import fold, network_nodes
-from switchmt_snn.spiking.layers import Conv, Dense, NeuronNode, Readout, no_rule, side_by_side
+from switchmt_snn.spiking.layers import Conv, Dense, NeuronNode, ReadoutNode, no_rule, side_by_side
 from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
 from switchmt_snn.spiking.neurons import LeakyLayer, LeakyNode, OpaqueNode
 
@@ -104,11 +104,11 @@ def test_layers_side_by_side_must_have_the_same_neurons() -> None:
 
 def test_readouts_by_hand() -> None:
     y_TBA = np.array([[[4.0, -4.0]], [[-4.0, 2.0]]], np.float32)
-    assert Readout("mean", 0.5)(y_TBA).tolist() == [[0.0, -1.0]]
-    assert Readout("last_membrane", 0.5)(y_TBA).tolist() == [[-2.0, 0.0]]
-    assert Readout("max_membrane", 0.5)(y_TBA).tolist() == [[4.0, 0.0]]
+    assert ReadoutNode("mean", 0.5)(y_TBA).tolist() == [[0.0, -1.0]]
+    assert ReadoutNode("last_membrane", 0.5)(y_TBA).tolist() == [[-2.0, 0.0]]
+    assert ReadoutNode("max_membrane", 0.5)(y_TBA).tolist() == [[4.0, 0.0]]
     with pytest.raises(ExportError, match="the readout is 'median', expected one of mean"):
-        Readout("median", 0.5)
+        ReadoutNode("median", 0.5)
 
 
 class TwiceAsFast(LeakyLayer):

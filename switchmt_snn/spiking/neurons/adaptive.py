@@ -54,9 +54,9 @@ class AdaptiveNode(NeuronNode):
         return "ALIF"
 
     @property
-    def states(self) -> int:
+    def states(self) -> tuple[str, ...]:
         """The membrane and the adaptation of the threshold."""
-        return len(AdaptiveLayer.STATE)
+        return AdaptiveLayer.STATE
 
 
 class AdaptiveLayer(NeuronLayer):

@@ -40,11 +40,11 @@ class OpaqueNode(NeuronNode):
 
     Attributes:
         name: the model, as a config names it.
-        variables: number of its state variables.
+        variables: names of its state variables.
     """
 
     name: str
-    variables: int
+    variables: tuple[str, ...]
 
     @property
     def kind(self) -> str:
@@ -52,7 +52,7 @@ class OpaqueNode(NeuronNode):
         return self.name
 
     @property
-    def states(self) -> int:
+    def states(self) -> tuple[str, ...]:
         """:attr:`variables`."""
         return self.variables
 
@@ -101,7 +101,7 @@ class NeuronLayer(nn.Module):
 
     def node(self, channels: int) -> NeuronNode:
         """The layer's description for exporters and counters; ``channels`` is O."""
-        return OpaqueNode(plugin_name(type(self), "network.neuron"), len(self.STATE))
+        return OpaqueNode(plugin_name(type(self), "network.neuron"), self.STATE)
 
     def forward(self, current: Tensor, state: NeuronState | None = None) -> tuple[Tensor, NeuronState]:
         """Run T steps.

@@ -48,9 +48,9 @@ class LeakyNode(NeuronNode):
         return "IF" if (self.beta_O == 1.0).all() else "LIF"
 
     @property
-    def states(self) -> int:
+    def states(self) -> tuple[str, ...]:
         """The membrane."""
-        return len(LeakyLayer.STATE)
+        return LeakyLayer.STATE
 
 
 class LeakyLayer(NeuronLayer):

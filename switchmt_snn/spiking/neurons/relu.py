@@ -21,9 +21,9 @@ class ReLUNode(NeuronNode):
         return "relu"
 
     @property
-    def states(self) -> int:
+    def states(self) -> tuple[str, ...]:
         """None."""
-        return 0
+        return ReLULayer.STATE
 
 
 class ReLULayer(NeuronLayer):

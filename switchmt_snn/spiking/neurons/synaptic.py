@@ -49,9 +49,9 @@ class SynapticNode(NeuronNode):
         return "Synaptic"
 
     @property
-    def states(self) -> int:
+    def states(self) -> tuple[str, ...]:
         """The synaptic current and the membrane."""
-        return len(SynapticLayer.STATE)
+        return SynapticLayer.STATE
 
 
 class SynapticLayer(NeuronLayer):
