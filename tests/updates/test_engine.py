@@ -7,15 +7,16 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import torch
 
-from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.config import Engine, ExperimentConfig, resolve
 from switchmt_snn.config.yaml_io import load_config
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.learner import Learner
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.updates import choice as machine
 from switchmt_snn.updates import compiled
@@ -146,6 +147,42 @@ def test_bfloat16_equals_eager_bfloat16(
         assert close.float().mean() > 0.97 or not close.numel() or is_chaotic, name
         our_error, their_error = ((x[name].float() - exact[name]).abs().sum() for x in (ours, theirs))
         assert our_error <= 1.3 * their_error + 0.01 * close.numel(), name
+
+
+def test_every_engine_of_the_config_is_in_the_registry() -> None:
+    assert set(get_args(Engine)) == ENGINES.keys()
+    for name, engine in ENGINES.items():
+        assert engine.name == name
+        assert engine.needs
+        assert engine.status()
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ({"engine": "nativ"}, "learning.engine is 'nativ', expected one of: auto, native"),
+        ({"precision": "bf16"}, "learning.precision is 'bf16', expected one of: auto, float32, bfloat16"),
+        ({"loss": "mae"}, "learning.loss is 'mae', expected one of: mse, huber"),
+        ({"gradient_clip": "l2"}, "learning.gradient_clip is 'l2', expected one of: none, value, norm"),
+    ],
+)
+def test_a_learner_refuses_an_unknown_name(setting: dict[str, str], words: str) -> None:
+    """Also one that no config has checked."""
+    config = minatar()
+    for name, value in setting.items():
+        object.__setattr__(config.learning, name, value)
+    network = build_network(config.network, ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), 1)
+    with pytest.raises(ConfigError, match=words):
+        Learner(network, config.learning, np.ones((3, 6), np.bool_), CPU, 0)
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_only_eager_divides_updates_among_processes(name: str) -> None:
+    """Others say so."""
+    device = torch.device("cuda" if name == "graph" else "cpu")
+    reason = ENGINES[name].unavailable(small_config(), device, processes=2)
+    assert (reason is None) == ENGINES[name].torchrun == (name == "eager")
+    assert reason is None or reason.startswith("torchrun started 2 processes")
 
 
 def test_a_run_keeps_the_engine_it_began_with() -> None:
