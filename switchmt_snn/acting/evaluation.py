@@ -41,7 +41,7 @@ class DecisionMaker(Protocol):
 
 @dataclass(frozen=True)
 class EvaluationProtocol:
-    """Everything that a score depends on besides the agent; printed with every score.
+    """Everything that a score depends on, apart from the agent; printed with every score.
 
     Attributes:
         episodes: per task.

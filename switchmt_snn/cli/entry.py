@@ -81,7 +81,8 @@ class ExportOptions:
     int8: bool = False
     """Weights as 8-bit integers, symmetric per output channel; the effect on decisions is measured."""
     nir_profile: Literal["portable", "spikingjelly", "exact", "legacy"] = "portable"
-    """NIR for most importers, for SpikingJelly's default dt, with loops for a subtract reset, or for nir <= 1.0.4."""
+    """portable: most importers. spikingjelly: SpikingJelly with its default dt. exact: also reset by subtraction (uses
+    loops). legacy: nir 1.0.4 and older."""
     parity_decisions: int = 1000
     """Recorded decisions per task on which the files are compared with the network."""
     checkpoint: Literal["last", "best"] = "last"
@@ -105,7 +106,7 @@ class ProfileOptions:
     observations: Path | None = None
     """For a NIR file: an .npz file with observations [N, ...] or encoded inputs [T, N, ...]."""
     out: Path | None = None
-    """Folder to write to. Default: the run's profile/; of several runs: the first one's."""
+    """Folder to write to. Default: RUN/profile/; with several runs, the comparison goes into the first one's."""
     json: bool = False
     """Print the profile as JSON."""
 

@@ -9,7 +9,7 @@ from switchmt_snn.config.checks import check_fields, require
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """The evaluation protocol; it is printed beside every score."""
+    """The evaluation protocol; it is printed with every score."""
 
     episodes: int = 30
     """Episodes per task."""
@@ -38,7 +38,7 @@ class RecordingConfig:
     checkpoint_every_steps: int = 50_000
     """Agent steps between two checkpoints."""
     keep_checkpoints: int = 2
-    """Newest checkpoints kept for resume (the best one is kept as weights besides)."""
+    """Newest checkpoints kept for resume (the weights of the best one are kept, too)."""
     metrics_every_steps: int = 1_000
     """Agent steps between two rows of metrics.jsonl."""
     tensorboard: bool = False

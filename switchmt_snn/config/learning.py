@@ -31,12 +31,12 @@ class LearningConfig:
     gradient_clip_at: float = 1.0
     """The bound of gradient_clip."""
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
-    """Synaptic products of an update; everything else, and acting, is float32. bfloat16 is faster where the processor
-    has it (AVX512-BF16, AMX, GPUs), and works, slower, elsewhere; auto takes it where it is there."""
+    """Number format of the matrix products in an update. Everything else is float32. auto: bfloat16 if the hardware has
+    it, else float32."""
     engine: Literal["auto"] | Engine = "auto"
-    """Updates operation by operation (eager), in C++ (native: CPU; built once, some 7 s), compiled by torch.compile (20
-    to 35 s per start), or compiled into a CUDA graph; each rounds in its own way. auto, on a CPU with a C++ compiler:
-    native for the nature trunk (AVX-512 or bfloat16), compiled from 150,000 updates on; else eager."""
+    """How updates are executed. eager: PyTorch. native: C++ (CPU only, compiled once in about 7 s). compiled:
+    torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for Atari-size
+    networks if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or more; else eager."""
     clip_rewards: bool = True
     """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576
@@ -44,16 +44,16 @@ class LearningConfig:
     replay_compression: Literal["auto", "zstd", "none"] = "auto"
     """Keep frames compressed, without loss and with the same samples. auto: if plain ones would take over 1 GiB."""
     replay_max_gib: float = 4.0
-    """Compressed frames of all tasks together take no more; while they would, the oldest leave."""
+    """Upper limit for all compressed frames together; when it is reached, the oldest frames are dropped."""
     replay_on_device: bool = False
-    """Keep frames as plain bytes where the network lies (a GPU's memory), so that batches are gathered there."""
+    """Store frames uncompressed on the network's device (GPU), and assemble batches there."""
     learning_starts_steps: int = 512
     """Transitions that a task must hold before it is sampled; until then its actions are random."""
     update_every_steps: int = 1
     """Agent steps between two updates."""
     overlap: bool = False
-    """Step the environments on another thread while an update runs. An action is then chosen before the update of its
-    step instead of after it; else the loop is the same."""
+    """Step the environments on another thread while an update runs. Actions then come from the network before the
+    current update instead of after it."""
     update_tasks: Literal["current", "all"] = "current"
     """Sample the current task's buffer (paper), or make one update from every task's buffer in turn (script)."""
     target_update_every_steps: int = 10_000

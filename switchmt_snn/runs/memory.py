@@ -56,9 +56,8 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
         frames = int(min(frames / COMPRESSION, config.learning.replay_max_gib * GIB))
     parameters = trainable_parameters(network) * 4
     snapshots = make_criterion(config.switching).snapshots(config.switching)
-    # A training step keeps currents, membranes, spikes and the surrogate's terms of T steps, the inputs as floats
-    # besides. Peak memory at batch 64 and 256 on the 84x84 network, before the
-    # surrogate's backward worked in place (which takes less): 7.1 floats per neuron and step.
+    # Activations: about 8 floats per neuron and step (measured 7.1 at batch 64 and 256 before the in-place backward,
+    # which needs less), plus the inputs as floats.
     batch = config.learning.batch_size
     steps = config.network.timesteps
     activations = batch * 4 * (8 * neurons * steps + 4 * math.prod(suite.observation_shape))

@@ -40,10 +40,10 @@ BEST_WINDOW_EPISODES = 20
 
 
 class Observer(Protocol):
-    """Watches a run; the loop never waits for it to agree."""
+    """Receives a run's events. It cannot change or stop the run."""
 
     def start(self, training: Training, folder: RunFolder, resumed_at: int | None) -> None:
-        """The run begins or goes on."""
+        """The run begins or continues."""
 
     def __call__(self, event: Event) -> None:
         """Something happened."""
