@@ -45,7 +45,7 @@ def matmul_gflops(dtype: torch.dtype, device: str = "cpu", size: int = 2048) -> 
 
 
 def spike_product_gflops(lanes: int = 16384, bits: int = 2048, outputs: int = 256) -> float:
-    """The machine's ceiling for products of spikes that are bits, as :func:`matmul_gflops` counts operations."""
+    """The machine's ceiling for products of spikes that are bits, as ``matmul_gflops`` counts operations."""
     panels = Panels.empty(lanes, bits)
     panels.words.random_()
     weight, bias = torch.randn(outputs, bits), torch.zeros(outputs)

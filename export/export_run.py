@@ -57,7 +57,7 @@ class ExportSettings:
         nir: one ``<task>.nir`` and ``<task>.json`` per task.
         tasks: also one ``decision_<task>.onnx`` for each of these.
         int8: store the weights as 8-bit integers with one step per output channel.
-        nir_dialect: see :mod:`switchmt_snn.export.formats.nir_writer`.
+        nir_dialect: see ``switchmt_snn.export.formats.nir_writer``.
         parity_decisions: recorded decisions per task that the files are compared on.
     """
 

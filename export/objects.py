@@ -35,8 +35,8 @@ def to_onnx(
     """A network as an ONNX model; ``onnx.save(to_onnx(run), path)`` writes it.
 
     Args:
-        source: see :data:`Source`.
-        kind: the whole decision, or one simulation step (:mod:`switchmt_snn.export.formats.onnx_writer`).
+        source: see ``Source``.
+        kind: the whole decision, or one simulation step (``switchmt_snn.export.formats.onnx_writer``).
         task: fold this task in; None serves all tasks by an input.
         int8: store weights as 8-bit integers.
 
@@ -56,12 +56,12 @@ def to_onnx(
 
 
 def to_nir(source: Source, task: str, dialect: NirDialect = "portable", int8: bool = False) -> nir.NIRGraph:
-    """One task of a network as a NIR graph; :func:`write_nir` writes it.
+    """One task of a network as a NIR graph; ``write_nir`` writes it.
 
     Args:
-        source: see :data:`Source`.
+        source: see ``Source``.
         task: whose statistics and gains are folded in.
-        dialect: see :mod:`switchmt_snn.export.formats.nir_writer`.
+        dialect: see ``switchmt_snn.export.formats.nir_writer``.
         int8: weights rounded to 8 bits (stored as float32; NIR has no integers).
 
     Raises:
@@ -87,7 +87,7 @@ def check_parity(
     """Export in memory, in every format that can express the network, and compare with it.
 
     Args:
-        source: see :data:`Source`.
+        source: see ``Source``.
         observations: raw observations ``[N, *shape]`` by task; None plays 1,000 decisions of each (not for a bare
             network, which has no games).
         dialect: NIR dialect.

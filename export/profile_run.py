@@ -129,13 +129,13 @@ def profile(
 def profile_file(
     file: str | Path, observations: str | Path, out: str | Path | None = None, targets: Sequence[str | Path] = ()
 ) -> Profile:
-    """:func:`profile` of a NIR file on stored observations (:func:`switchmt_snn.export.counts.nir_file.profile_nir`).
+    """``profile`` of a NIR file on stored observations (``switchmt_snn.export.counts.nir_file.profile_nir``).
 
     Args:
         file: a NIR graph.
         observations: an .npz file.
         out: where; None takes ``FILE-profile/`` beside the file.
-        targets: as in :func:`profile`; chips are for runs only.
+        targets: as in ``profile``; chips are for runs only.
 
     Raises:
         ConfigError: a target that is not one.

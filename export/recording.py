@@ -49,7 +49,7 @@ def file_name(task: str) -> str:
 
 
 def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recording]:
-    """:func:`recorded_play` of every task in turn; while one is used, the next are being played."""
+    """``recorded_play`` of every task in turn; while one is used, the next are being played."""
 
     def one(task: str) -> Recording:
         return recorded_play(agent.independent(), folder, task, decisions)
@@ -111,7 +111,7 @@ def _read(path: Path, task: str, suite: TaskSuite) -> Recording:
 
 
 def play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> Recording:
-    """Play at least ``decisions`` decisions of a task in :data:`COPIES` copies."""
+    """Play at least ``decisions`` decisions of a task in ``COPIES`` copies."""
     pieces = list(play_in_pieces(agent, task, decisions, epsilon, seed))
     observations, actions = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
     flat = observations.reshape(-1, *agent.suite.observation_shape)
@@ -121,7 +121,7 @@ def play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> 
 def play_in_pieces(
     agent: Agent, task: str, decisions: int, epsilon: float, seed: int
 ) -> Iterator[tuple[npt.NDArray[Any], npt.NDArray[np.int64]]]:
-    """:func:`play` step by step: observations ``[COPIES, n, *shape]`` and actions ``[COPIES, n]``, n a few steps."""
+    """``play`` step by step: observations ``[COPIES, n, *shape]`` and actions ``[COPIES, n]``, n a few steps."""
     index, suite = agent.suite.index(task), agent.suite
     rng = np.random.default_rng([seed, index])
     valid = np.flatnonzero(suite.valid_actions_KA[index])

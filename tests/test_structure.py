@@ -32,3 +32,10 @@ def test_files_and_functions_stay_readable(path: Path) -> None:
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef):
             assert (node.end_lineno or 0) - node.lineno <= 70, node.name
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_docstrings_have_no_sphinx_roles(path: Path) -> None:
+    """The site renders Markdown: write ``name``."""
+    roles = (":" + role + ":`" for role in ("func", "class", "meth", "mod", "data", "attr", "exc"))
+    assert not any(role in path.read_text() for role in roles), f"{path}: write ``name``, no Sphinx role"

@@ -1,7 +1,7 @@
 """Will it fit on the chip? Every layer against the chip's public limits, with what the check leaves out.
 
 A "no" names what is short and, if one exists, the largest layer that fits, found by the same check. A "yes" is as good
-as what is counted: read :attr:`ChipFit.conditions`.
+as what is counted: read ``ChipFit.conditions``.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def _(node: Dense) -> list[LayerShape]:
 
 
 def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
-    """Check a network, as :func:`layer_shapes` gives it, against a chip.
+    """Check a network, as ``layer_shapes`` gives it, against a chip.
 
     Args:
         layers: in forward order, the head last.

@@ -47,7 +47,7 @@ class Resource:
 
     Attributes:
         resource: its name in reports.
-        rule: how much a layer needs: a name in :data:`switchmt_snn.export.chips.rules.RULES`.
+        rule: how much a layer needs: a name in ``switchmt_snn.export.chips.rules.RULES``.
         has: how much each layer, each core or the whole chip has (``per``).
         only: the layers that need it; ``hidden`` are all but the last.
         whole_channels: whether an output channel stays on one core if it fits there; else layers are divided evenly.

@@ -1,8 +1,8 @@
 """Mapping rules that a chip's file picks by name: which cores a layer takes. The set is closed, as that of the rules.
 
-- :class:`WholeCores`: layers are divided among equal cores; no core holds two layers.
-- :class:`SharedCore`: all layers share one core.
-- :class:`CorePerLayer`: every layer is a convolution on one core of its own.
+- ``WholeCores``: layers are divided among equal cores; no core holds two layers.
+- ``SharedCore``: all layers share one core.
+- ``CorePerLayer``: every layer is a convolution on one core of its own.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class ConvolutionCore:
 @dataclass(frozen=True)
 class CorePerLayer(Mapping):
     """Every layer takes one core that holds its kernels and its neurons, both rounded up to powers of two
-    (:func:`convolution_memory_ki`); kernels are square, and strides are listed.
+    (``convolution_memory_ki``); kernels are square, and strides are listed.
 
     Attributes:
         cores: in the chip's order; they may differ.

@@ -1,6 +1,6 @@
 """Rules that a chip's file picks by name: how much of a resource one layer needs.
 
-The set is closed: a file cannot hold a formula. A new rule is a function here, in :data:`RULES`, with a test.
+The set is closed: a file cannot hold a formula. A new rule is a function here, in ``RULES``, with a test.
 """
 
 from __future__ import annotations

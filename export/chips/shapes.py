@@ -35,7 +35,7 @@ class LayerShape:
 
     @property
     def kind(self) -> str:
-        """One of :data:`LAYER_KINDS`."""
+        """One of ``LAYER_KINDS``."""
         return "dense" if self.kernel is None else "conv"
 
     @property

@@ -2,7 +2,7 @@
 
 Counted is the network as it is deployed: one task folded in, the head fed with every step's spikes, the first layer
 computed once per decision under direct encoding (its input does not change). Definitions:
-:mod:`switchmt_snn.export.counts.synapses`.
+``switchmt_snn.export.counts.synapses``.
 
 Twins stand beside it: the ANN of the same shape does one multiplication per weight and position (dense), and the
 quantised ANN does the same on activations of ceil(log2(T + 1)) bits, as many values as a spike count over T can take.

@@ -2,7 +2,7 @@
 
 An ``.npz`` file holds the inputs: raw ``observations`` for a graph with this package's metadata, which says how to
 encode them, or encoded ``inputs`` for anybody's graph. A layer is a node with weights and the spiking node that it
-feeds; what is counted, and how often, is as in :mod:`switchmt_snn.export.counts.network`.
+feeds; what is counted, and how often, is as in ``switchmt_snn.export.counts.network``.
 
 Shapes: T simulation steps, N decisions, B batch, ... a node's own shape.
 """
@@ -46,7 +46,7 @@ def profile_nir(path: Path, observations: Path) -> TaskProfile:
     """Count what a NIR file does; the time is that of the interpreter, the memory that of the ``.npz``.
 
     Args:
-        path: a NIR file; one Input, one Output, nodes that :class:`NirInterpreter` knows, one source per node with
+        path: a NIR file; one Input, one Output, nodes that ``NirInterpreter`` knows, one source per node with
             weights, weights before every spiking node.
         observations: an ``.npz`` with either ``observations``, raw ``[N, *shape]`` (the graph must have this package's
             metadata), or ``inputs``, encoded ``[T, N, *shape of the Input node]``; and, before the ``dt`` of the

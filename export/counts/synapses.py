@@ -154,7 +154,7 @@ class NeuronCounter:
 
     @property
     def rate_histogram(self) -> tuple[int, ...]:
-        """Number of neurons that fire in each of :data:`RATE_BINS` equal ranges of spikes per step."""
+        """Number of neurons that fire in each of ``RATE_BINS`` equal ranges of spikes per step."""
         rate_N = self.rate_N
         return tuple(np.histogram(rate_N[rate_N > 0], RATE_BINS, (0.0, 1.0))[0].tolist())
 

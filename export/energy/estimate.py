@@ -52,7 +52,7 @@ class Target:
     Attributes:
         operations_pj: by operation: ``ac``, ``ac_conv`` (of convolutions, if they differ), ``mac``, ``neuron_update``,
             ``spike``.
-        evidence: one of :data:`EVIDENCE`.
+        evidence: one of ``EVIDENCE``.
     """
 
     name: str

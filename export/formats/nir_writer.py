@@ -2,7 +2,7 @@
 
 The graph takes the encoded input of one simulation step and ends at the head's Affine; the host encodes, runs T steps
 and applies the readout (mean: averages the outputs). NIR is continuous in time: ``dt`` is the length of one simulation
-step that makes the discrete network of :mod:`switchmt_snn.spiking.neurons` out of it by explicit Euler steps.
+step that makes the discrete network of ``switchmt_snn.spiking.neurons`` out of it by explicit Euler steps.
 
 Dialects:
 
@@ -84,7 +84,7 @@ def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable
 
 
 def can_express(network: FoldedNetwork, dialect: NirDialect = "portable") -> bool:
-    """Whether :func:`nir_graph` has an exact graph for the network."""
+    """Whether ``nir_graph`` has an exact graph for the network."""
     try:
         nir_graph(network, 0, dialect)
     except ExportError:

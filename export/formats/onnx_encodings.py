@@ -1,4 +1,4 @@
-"""The encodings as ONNX operators: the computation of :mod:`switchmt_snn.spiking.encodings`."""
+"""The encodings as ONNX operators: the computation of ``switchmt_snn.spiking.encodings``."""
 
 from __future__ import annotations
 

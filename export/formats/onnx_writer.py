@@ -4,8 +4,8 @@
 - ``step``: one simulation step with every neuron state as an input and an output, for hosts that stream.
 
 A membrane is U(t) *before* the reset that its own spike causes, as everywhere in this package (see
-:mod:`switchmt_snn.spiking.neurons`). Each node of the network has its rule in
-:mod:`switchmt_snn.export.formats.onnx_nodes`, each encoding in :mod:`switchmt_snn.export.formats.onnx_encodings`.
+``switchmt_snn.spiking.neurons``). Each node of the network has its rule in
+``switchmt_snn.export.formats.onnx_nodes``, each encoding in ``switchmt_snn.export.formats.onnx_encodings``.
 
 Shapes: T simulation steps, B batch, O outputs of a layer, K tasks, A actions, L neuron layers.
 """

@@ -46,6 +46,6 @@ def active_neurons(agent: Agent, observations: npt.NDArray[Any], task: int, seed
 
 
 def chunks(observations: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any]]:
-    """Batches of at most :data:`CHUNK` decisions."""
+    """Batches of at most ``CHUNK`` decisions."""
     for start in range(0, len(observations), CHUNK):
         yield np.ascontiguousarray(observations[start : start + CHUNK])

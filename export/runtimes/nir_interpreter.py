@@ -226,7 +226,7 @@ def _geometry(name: str, node: nir.Conv2d) -> tuple[Pair, Pair]:
     """Stride and padding of a convolution. NIR files hold them as a number, a pair or an array; padding also by name.
 
     Raises:
-        ExportError: dilation, groups, or a padding that :func:`_convolve` does not know.
+        ExportError: dilation, groups, or a padding that ``_convolve`` does not know.
     """
     for what in ("dilation", "groups"):
         value = getattr(node, what)

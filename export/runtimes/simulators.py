@@ -28,7 +28,7 @@ class Simulator:
     Attributes:
         modules: what must be importable.
         convention: in words, for reports.
-        interpreter: the matching options of :class:`~switchmt_snn.export.runtimes.nir_interpreter.NirInterpreter`.
+        interpreter: the matching options of ``NirInterpreter``.
         run: ``(graph, inputs_TB, dt) -> outputs_TB``.
     """
 

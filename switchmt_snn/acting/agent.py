@@ -72,7 +72,7 @@ class Agent:
         return values[0] if observation.shape == expected else values
 
     def act(self, observation: npt.NDArray[Any], task: str | int) -> Any:
-        """The greedy action (an int) for one observation, or actions ``[B]`` for a batch; see :meth:`q_values`.
+        """The greedy action (an int) for one observation, or actions ``[B]`` for a batch; see ``q_values``.
 
         Example:
             >>> import numpy as np

@@ -1,6 +1,6 @@
 """Checks of config values, the same for a config made in Python, in YAML, or by flags.
 
-Every config calls :func:`check_fields` as it is made, and then :func:`require` for ranges.
+Every config calls ``check_fields`` as it is made, and then ``require`` for ranges.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def load_plugin(name: str, key: str) -> Any:
 
 
 def plugin_name(plugin: type[Any], key: str) -> PluginName:
-    """The ``package.module:Name`` by which :func:`load_plugin` finds a class again.
+    """The ``package.module:Name`` by which ``load_plugin`` finds a class again.
 
     A class of the script that runs gets the script's name: ``own_policy:MyCriterion`` in ``python own_policy.py``.
 

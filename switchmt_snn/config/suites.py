@@ -1,6 +1,6 @@
 """Task suites by name, as far as a config needs them: what null and ``auto`` mean in each suite.
 
-The suites themselves are above this package, in :mod:`switchmt_snn.tasks`.
+The suites themselves are above this package, in ``switchmt_snn.tasks``.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def to_dict(config: ExperimentConfig) -> dict[str, Any]:
 
 
 def to_yaml(config: ExperimentConfig) -> str:
-    """The config as YAML that :func:`load_config` reads back unchanged."""
+    """The config as YAML that ``load_config`` reads back unchanged."""
     return yaml.safe_dump(to_dict(config), sort_keys=False, allow_unicode=True)
 
 

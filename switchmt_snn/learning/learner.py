@@ -192,7 +192,7 @@ class Learner(Stateful):
         return means
 
     def is_finite(self) -> bool:
-        """Whether every loss since :meth:`take_means` and every parameter is finite."""
+        """Whether every loss since ``take_means`` and every parameter is finite."""
         finite = torch.isfinite(self.loss_sum)
         for parameter in self.network.parameters():
             finite = finite & torch.isfinite(parameter).all()

@@ -1,4 +1,4 @@
-"""A learner whose updates several processes divide (see :mod:`switchmt_snn.updates.processes`)."""
+"""A learner whose updates several processes divide (see ``switchmt_snn.updates.processes``)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from switchmt_snn.updates.processes import COPY_TARGET, LOAD, STOP, UPDATE, Divi
 
 
 class SharedLearner(Learner):
-    """Every process has one. The first process uses it as any learner; the others call :meth:`serve`.
+    """Every process has one. The first process uses it as any learner; the others call ``serve``.
 
     Whatever changes the learner is announced by the first process and done in all of them.
     """
@@ -33,7 +33,7 @@ class SharedLearner(Learner):
         seed: int,
         group: ProcessGroup,
     ) -> None:
-        """As :class:`Learner`; the networks of all processes are equal.
+        """As ``Learner``; the networks of all processes are equal.
 
         Args:
             network: fresh or trained; moved to ``device``.

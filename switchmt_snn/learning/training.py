@@ -1,7 +1,7 @@
 """Algorithm 1 of the paper: one spiking Q-network learns several tasks and switches between them.
 
-:meth:`Training.events` is the loop: a generator of events. It knows no screen and no file. Its caller decides when to
-save and when to stop; the state is whole whenever a :class:`Stepped` event is yielded.
+``Training.events`` is the loop: a generator of events. It knows no screen and no file. Its caller decides when to
+save and when to stop; the state is whole whenever a ``Stepped`` event is yielded.
 """
 
 from __future__ import annotations

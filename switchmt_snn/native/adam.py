@@ -34,7 +34,7 @@ class _Tensor(ctypes.Structure):
 
 
 class NativeAdam(torch.optim.Adam):
-    """:class:`torch.optim.Adam` for float32 parameters on a CPU; its state is the same.
+    """``torch.optim.Adam`` for float32 parameters on a CPU; its state is the same.
 
     Steps are those of ``fused=True`` to rounding. The copies of weights that a native network has are written in the
     same pass. Hooks of steps are not called.
@@ -48,7 +48,7 @@ class NativeAdam(torch.optim.Adam):
         self._bound: list[dict[str, Any] | None] = [None] * len(group["params"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a state of this class or of :class:`torch.optim.Adam`.
+        """Go on from a state of this class or of ``torch.optim.Adam``.
 
         Raises:
             ValueError: its moments are not those of the parameters; nothing is changed.

@@ -1,6 +1,6 @@
-"""A network's decision in C++: the same function as :meth:`QNetwork.decide`, with its backward written by hand.
+"""A network's decision in C++: the same function as ``QNetwork.decide``, with its backward written by hand.
 
-Synaptic products are in :mod:`switchmt_snn.native.products`, neurons in :mod:`switchmt_snn.native.neurons`; channels
+Synaptic products are in ``switchmt_snn.native.products``, neurons in ``switchmt_snn.native.neurons``; channels
 are innermost in memory. For autograd, everything from the encoded inputs to the heads' outputs is one operation.
 ``native/README.md`` draws both directions side by side.
 
@@ -25,7 +25,7 @@ from switchmt_snn.native.supports import spikes_as_bits
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
 Backward = Callable[[Tensor], list[Tensor]]
-"""From the gradient of the heads' outputs to those of :attr:`NativeNetwork._differentiated`."""
+"""From the gradient of the heads' outputs to those of ``NativeNetwork._differentiated``."""
 
 
 class TaskParameters(NamedTuple):
@@ -49,7 +49,7 @@ class NativeNetwork:
     """
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
-        """Raises ConfigError for a network that :mod:`switchmt_snn.native.supports` refuses."""
+        """Raises ConfigError for a network that ``switchmt_snn.native.supports`` refuses."""
         supports.require(network)
         self._network = network
         self._parameters = list(network.parameters())
@@ -84,18 +84,18 @@ class NativeNetwork:
         return x.movedim(2, -1).contiguous()
 
     def copies_are_current(self) -> bool:
-        """Whether all :attr:`copies` equal the parameters as they are now."""
+        """Whether all ``copies`` equal the parameters as they are now."""
         return self._version_now() == self._copied_version
 
     def mark_copies_current(self) -> None:
-        """Call this after updating parameters *and* their copies; otherwise the next :meth:`for_task` copies anew."""
+        """Call this after updating parameters *and* their copies; otherwise the next ``for_task`` copies anew."""
         self._copied_version = self._version_now()
 
     def _version_now(self) -> int:
         return sum(parameter._version for parameter in self._parameters)
 
     def for_task(self, task: int) -> TaskParameters:
-        """What :meth:`decide` needs for a task, from the parameters as they are now.
+        """What ``decide`` needs for a task, from the parameters as they are now.
 
         Raises:
             IndexError: unknown task.
@@ -121,10 +121,10 @@ class NativeNetwork:
         """Q-values ``[B, A]`` of several inputs at once, which shares products with the streams' weights.
 
         Args:
-            x: of :meth:`inputs`; normalized by the batch if ``training``, and then its Q-values have a gradient.
-            parameters: of :meth:`for_task`.
+            x: of ``inputs``; normalized by the batch if ``training``, and then its Q-values have a gradient.
+            parameters: of ``for_task``.
             training: see ``x``.
-            other_inputs: of :meth:`inputs`; normalized by the running statistics, their Q-values have no gradient.
+            other_inputs: of ``inputs``; normalized by the running statistics, their Q-values have no gradient.
         """
         if training and torch.is_grad_enabled():
             outputs = _Decision.apply(self, x, parameters, other_inputs, *self._differentiated)  # type: ignore[no-untyped-call]

@@ -45,7 +45,7 @@ class Spikes(NamedTuple):
     """What a layer sends to the next one."""
 
     values: Tensor
-    """Dense values ``[T, ..., C]``; or int32 words ``[T, ..., words]``, see :data:`Form`."""
+    """Dense values ``[T, ..., C]``; or int32 words ``[T, ..., words]``, see ``Form``."""
     channels: int
     is_bits: bool = False
 
@@ -71,11 +71,11 @@ class Currents(NamedTuple):
 class Neurons:
     """T steps of a network's neurons on synaptic products ``[S, R, C]``, float32 or bfloat16.
 
-    Spikes are bitwise those of :class:`~switchmt_snn.spiking.neurons.LeakyLayer` for the same currents.
+    Spikes are bitwise those of ``LeakyLayer`` for the same currents.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
-        """Raises ConfigError for a setting that :mod:`~switchmt_snn.native.supports` does not name."""
+        """Raises ConfigError for a setting that ``supports`` does not name."""
         supports.require_setting(config)
         slope = DEFAULT_SLOPE[config.surrogate] if config.surrogate_slope is None else config.surrogate_slope
         beta = 1.0 if config.neuron == "IF" else min(max(config.beta, 0.0), 1.0)
@@ -87,7 +87,7 @@ class Neurons:
         """Spikes; and the currents' scale, shift, mean and inverse deviation ``[4, C]``, which the backward needs.
 
         Raises:
-            ValueError: ``y`` is not contiguous float32 or bfloat16 of 1 or T steps; see also :meth:`Currents.pointers`.
+            ValueError: ``y`` is not contiguous float32 or bfloat16 of 1 or T steps; see also ``Currents.pointers``.
         """
         steps, rows, channels = y_SRC.shape
         if steps not in (1, self.timesteps):
@@ -122,7 +122,7 @@ class Neurons:
         If the currents had moments, these are taken for those of ``y``, and the gradient goes through them.
 
         Raises:
-            ValueError: ``y`` or ``currents_4C`` are not those of :meth:`fire`, or the gradient is not one of T steps,
+            ValueError: ``y`` or ``currents_4C`` are not those of ``fire``, or the gradient is not one of T steps,
                 in float32 or the dtype of ``y``.
         """
         steps, rows, channels = y_SRC.shape
@@ -159,7 +159,7 @@ def batch_moments(
     """Mean and biased variance of every channel ``[C]`` over steps and rows.
 
     A running mean and (unbiased) variance, if given, move towards them, as in
-    :meth:`~switchmt_snn.spiking.normalization.TaskBatchNorm.move`.
+    ``move``.
 
     Raises:
         ValueError: running ones are not contiguous float32 ``[C]``, or a single row has no variance to follow.

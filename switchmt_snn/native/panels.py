@@ -61,7 +61,7 @@ class Panels(NamedTuple):
         Args:
             words_Iw: int32 words of channels.
             channels: C.
-            words: memory to write to, such as a part of :meth:`empty`'s; None allocates it.
+            words: memory to write to, such as a part of ``empty``'s; None allocates it.
 
         Raises:
             ValueError: words are not contiguous int32, or not as many as needed.

@@ -37,6 +37,6 @@ def pointer(x: Tensor, dtypes: tuple[torch.dtype, ...], shape: tuple[int | None,
 
 
 def typed_pointer(x: Tensor, shape: tuple[int | None, ...] | None = None) -> tuple[int, int]:
-    """:func:`pointer` of a float32 or bfloat16 tensor, and 1 if it is bfloat16: the pair of arguments of C++ functions
+    """``pointer`` of a float32 or bfloat16 tensor, and 1 if it is bfloat16: the pair of arguments of C++ functions
     that read both."""
     return pointer(x, FLOATS, shape), int(x.dtype == torch.bfloat16)

@@ -1,5 +1,5 @@
-"""Synaptic products with their gradients: of spikes that are kept as bits (:mod:`~switchmt_snn.native.panels`), or of
-dense values (:mod:`~switchmt_snn.native.dense`).
+"""Synaptic products with their gradients: of spikes that are kept as bits (``panels``), or of
+dense values (``dense``).
 
 Products of bits are float32 sums of weights, at some three times the speed of float32 multiplications.
 
@@ -33,7 +33,7 @@ Gradients = Callable[[Tensor, bool], tuple[Tensor | None, list[Tensor]]]
 """The backward of some products, from their gradient (``[I, ..., O]``, contiguous, in their dtype).
 
 It returns the gradient of the inputs, if asked for, dense ``[I, ..., C]`` in the memory order of the inputs; and those
-of :attr:`Synapses.parameters`, float32.
+of ``Synapses.parameters``, float32.
 """
 
 
@@ -49,7 +49,7 @@ class Synapses:
     """
 
     def __init__(self, layers: Sequence[nn.Linear | nn.Conv2d], dtype: torch.dtype) -> None:
-        """Nothing is read yet; see :meth:`read`."""
+        """Nothing is read yet; see ``read``."""
         weights, biases = [layer.weight for layer in layers], [cast(Tensor, layer.bias) for layer in layers]
         self.parameters = tuple(part for layer in zip(weights, biases, strict=True) for part in layer)
         sizes = [len(weight) for weight in weights]

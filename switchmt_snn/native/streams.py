@@ -64,7 +64,7 @@ class Gains:
         return gain_N
 
     def gradients(self, task: int, grad_gain_N: Tensor) -> list[Tensor]:
-        """Gradients of :attr:`parameters`, from that of :meth:`of_task`.
+        """Gradients of ``parameters``, from that of ``of_task``.
 
         Raises:
             IndexError: unknown task.
@@ -101,7 +101,7 @@ class Heads:
     """
 
     def __init__(self, network: QNetwork) -> None:
-        """Reads no parameter yet; see :meth:`read`."""
+        """Reads no parameter yet; see ``read``."""
         layers = {name: cast(Stream, stream).head for name, stream in network.streams.items()}
         self.parameters = tuple(part for layer in layers.values() for part in (layer.weight, layer.bias))
         outputs = [layer.out_features for layer in layers.values()]
@@ -143,7 +143,7 @@ class Heads:
         return q_SBA
 
     def gradients(self, spikes_SBN: Tensor, grad_SBA: Tensor, scale: float) -> tuple[Tensor, list[Tensor]]:
-        """Gradients of the spikes, times a scale, and of :attr:`parameters`.
+        """Gradients of the spikes, times a scale, and of ``parameters``.
 
         Raises:
             ValueError: spikes or gradient are not contiguous float32 of all neurons or actions.

@@ -7,8 +7,8 @@ frame is the next slot's. The last frame of an episode has a slot of its own wit
 is right at termination and truncation, and no stack crosses an episode border (frames before the start are zeros).
 
 Old frames leave in blocks of a few slots: when the first slot of a block is overwritten, and the oldest while frames
-take more bytes than they may. Frames lie plain or compressed (:mod:`switchmt_snn.replay.frames`), or on
-the learner's device (:mod:`switchmt_snn.replay.on_device`); else all is alike.
+take more bytes than they may. Frames lie plain or compressed (``switchmt_snn.replay.frames``), or on
+the learner's device (``switchmt_snn.replay.on_device``); else all is alike.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from switchmt_snn.replay.on_device import DeviceFrames
 BLOCK_SLOTS = 16
 """Frames that leave, and are compressed, together. Fewer take more bytes; of more, one frame takes longer to read."""
 SEGMENT_SLOTS = 1024
-"""Slots per stored segment (see :meth:`FrameReplay.segments`)."""
+"""Slots per stored segment (see ``FrameReplay.segments``)."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class FrameReplay:
         self._write(lane, frame, age=0)
 
     def add(self, lane: int, action: int, reward: float, terminated: bool, next_frame: npt.NDArray[Any]) -> None:
-        """Add the transition from a lane's newest frame. At an episode's end, :meth:`begin` must follow."""
+        """Add the transition from a lane's newest frame. At an episode's end, ``begin`` must follow."""
         slot = self._slot(lane, self._written[lane] - 1)
         self._actions[slot] = action
         self._rewards[slot] = reward
@@ -225,7 +225,7 @@ class FrameReplay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put everything but the frames back; :meth:`load_segment` brings the frames."""
+        """Put everything but the frames back; ``load_segment`` brings the frames."""
         self._written[:] = state["written"]
         self._oldest[:] = state["oldest"]
         self.transitions_added = int(state["transitions_added"])

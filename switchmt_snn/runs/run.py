@@ -57,7 +57,7 @@ class Observer(Protocol):
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a call of :func:`train` ended.
+    """How a call of ``train`` ended.
 
     Attributes:
         status: ``finished``, ``stopped`` (by a signal; the same command continues), ``already_finished``, or ``served``

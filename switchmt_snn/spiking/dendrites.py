@@ -42,7 +42,7 @@ class ActiveDendrites(nn.Module):
         return self.tasks_K[task : task + 1]
 
     def gains(self, task_1: Tensor) -> Tensor:
-        """As :meth:`forward`, with the task as a tensor: code that is compiled once serves every task."""
+        """As ``forward``, with the task as a tensor: code that is compiled once serves every task."""
         responses_NS = self.segments_NSK.index_select(2, task_1).squeeze(2)
         if self.gating == "max":
             chosen_N = responses_NS.amax(dim=1)

@@ -8,8 +8,8 @@ Dense        ``current = scale_KO[k] * (W x) + shift_KO[k]``, then k winners per
 ReadoutNode  Q-values from the head's outputs at the T steps
 ===========  =========================================================================================
 
-The neuron models describe themselves as subclasses of :class:`NeuronNode`. A reader is a ``functools.singledispatch``
-function over these classes. Its default raises :class:`ExportError` with the node's name, so a reader never treats a
+The neuron models describe themselves as subclasses of ``NeuronNode``. A reader is a ``functools.singledispatch``
+function over these classes. Its default raises ``ExportError`` with the node's name, so a reader never treats a
 node that it does not know as one that it knows.
 
 Shapes: O output channels or features, I input channels or features, K tasks, T simulation steps, B batch, A actions.
@@ -89,7 +89,7 @@ class SynapseNode:
         raise NotImplementedError(f"{type(self).__name__} does not count its operations, expected a number")
 
     def over_weight(self, values_O: Array) -> Array:
-        """Values per output channel, shaped to broadcast over :attr:`weight`."""
+        """Values per output channel, shaped to broadcast over ``weight``."""
         return values_O.reshape(-1, *(1,) * (self.weight.ndim - 1))
 
     def folded(self, task: int) -> tuple[Float, Float]:
@@ -138,9 +138,9 @@ class Dense(SynapseNode):
 
     Attributes:
         weight: ``[O, I]``.
-        groups: equal parts of the output that :attr:`k_winners` compares within (a dueling network has two).
+        groups: equal parts of the output that ``k_winners`` compares within (a dueling network has two).
         k_winners: currents kept per group and step, or None.
-        gated: whether :attr:`scale_KO` holds the gains of active dendrites.
+        gated: whether ``scale_KO`` holds the gains of active dendrites.
     """
 
     groups: int = 1

@@ -139,7 +139,7 @@ class Stream(nn.Module):
 
 
 class QNetwork(nn.Module):
-    """Observations of one task -> Q-values. Build it with :func:`build_network`.
+    """Observations of one task -> Q-values. Build it with ``build_network``.
 
     Attributes:
         config: the resolved network settings.
@@ -218,7 +218,7 @@ class QNetwork(nn.Module):
                 starts from rest and, if None, keeps nothing.
             activity: if given, filled with each neuron layer's spikes (or activations) ``[T, B, ...]`` by name.
             generator: source of random numbers of the ``rate`` encoding.
-            precision: dtype of all synaptic products but the head's (:func:`synaptic_products`).
+            precision: dtype of all synaptic products but the head's (``synaptic_products``).
 
         Returns:
             ``[B, A]`` float Q-values.
@@ -233,7 +233,7 @@ class QNetwork(nn.Module):
         return self.encoder(numbers * self.observation.scale, generator)
 
     def context(self, task: int) -> Context:
-        """What a task changes in the network; the only thing that :meth:`decide` is told of it."""
+        """What a task changes in the network; the only thing that ``decide`` is told of it."""
         layers = {**self.trunk, **self.streams}
         return {name: cast(TrunkLayer | Stream, layer).context(task) for name, layer in layers.items()}
 
@@ -247,7 +247,7 @@ class QNetwork(nn.Module):
         precision: torch.dtype | None = None,
         training: bool | None = None,
     ) -> Tensor:
-        """Q-values ``[B, A]`` of encoded inputs ``[T, B, ...]`` in a task's context; the rest as in :meth:`forward`.
+        """Q-values ``[B, A]`` of encoded inputs ``[T, B, ...]`` in a task's context; the rest as in ``forward``.
 
         ``training`` normalises by the batch or by the running statistics; None does as the module's mode says.
         """

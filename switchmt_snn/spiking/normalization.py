@@ -36,7 +36,7 @@ class TaskBatchNorm(nn.Module):
         return self.normalize(x, self.statistics(task), self.training)
 
     def normalize(self, x: Tensor, statistics: tuple[Tensor, ...], training: bool) -> Tensor:
-        """As :meth:`forward`, with a task's running mean and variance ``[C]`` and the mode handed in."""
+        """As ``forward``, with a task's running mean and variance ``[C]`` and the mode handed in."""
         mean_C, var_C = statistics
         return F.batch_norm(x, mean_C, var_C, self.weight, self.bias, training, self.momentum, self.epsilon)
 

@@ -35,7 +35,7 @@ class Readout:
         return self.integrate(head(spikes_TBN))
 
     def integrate(self, outputs_TBO: Tensor) -> Tensor:
-        """As :meth:`stream`, from the head's output at every step."""
+        """As ``stream``, from the head's output at every step."""
         raise NotImplementedError(f"{type(self).__name__} defines no integrate, expected its equation")
 
     def q_values(self, combined: Tensor) -> Tensor:

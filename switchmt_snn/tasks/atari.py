@@ -19,7 +19,7 @@ SIDE_PIXELS = 84
 
 
 class AtariCopies:
-    """Copies of one game. Frames are single (stacking is done once, in :mod:`switchmt_snn.tasks.play`)."""
+    """Copies of one game. Frames are single (stacking is done once, in ``switchmt_snn.tasks.play``)."""
 
     def __init__(self, game: str, num_envs: int, config: TasksConfig) -> None:
         """Open the game; every option of AtariVectorEnv that changes what is learned is set explicitly."""

@@ -1,7 +1,7 @@
 """Playing a task: frame stacks, episode seeds, and the actions since each episode's start.
 
-An episode is a function of its seed and its actions (see :class:`~switchmt_snn.tasks.suite.TaskEnvironment`), so a
-checkpoint needs no emulator state: it stores seed and actions of the running episodes, and :meth:`Play.load_state_dict`
+An episode is a function of its seed and its actions (see ``TaskEnvironment``), so a
+checkpoint needs no emulator state: it stores seed and actions of the running episodes, and ``Play.load_state_dict``
 plays them again.
 """
 
@@ -29,7 +29,7 @@ class Play:
             AtariVectorEnv stacks).
         returns: raw return of each running episode.
         lengths_steps: length of each running episode.
-        over: copies without a running episode; :meth:`begin` must start one before the next :meth:`step`.
+        over: copies without a running episode; ``begin`` must start one before the next ``step``.
     """
 
     def __init__(self, suite: TaskSuite, task: int, num_envs: int) -> None:
@@ -58,7 +58,7 @@ class Play:
         return frames
 
     def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
-        """Play one step in every copy. Ended copies keep their last observation until :meth:`begin`."""
+        """Play one step in every copy. Ended copies keep their last observation until ``begin``."""
         result = self._environment.step(actions)
         c = self._channels
         self.observations[:, :-c] = self.observations[:, c:]

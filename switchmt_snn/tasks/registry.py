@@ -16,7 +16,7 @@ from switchmt_snn.tasks.minatar import MinAtarSuite
 from switchmt_snn.tasks.suite import Suite, TaskSuite
 
 SUITES: dict[str, type[Suite]] = {suite.name: suite for suite in (AtariSuite, MinAtarSuite, GymSuite)}
-"""By name: the built-in suites, and those that :func:`register_suite` added."""
+"""By name: the built-in suites, and those that ``register_suite`` added."""
 
 AnySuite = TypeVar("AnySuite", bound=type[Suite])
 
@@ -28,7 +28,7 @@ def register_suite(suite: AnySuite) -> AnySuite:
     module can be imported (it is installed, or its folder is in PYTHONPATH).
 
     Raises:
-        ConfigError: not a complete :class:`~switchmt_snn.tasks.suite.Suite`, a local class, or a name that another
+        ConfigError: not a complete ``Suite``, a local class, or a name that another
             suite has.
     """
     _require_complete(suite)

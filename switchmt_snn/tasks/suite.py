@@ -1,6 +1,6 @@
-"""What a suite of tasks is: :class:`Suite` states its facts, :class:`TaskSuite` is what it makes from a config.
+"""What a suite of tasks is: ``Suite`` states its facts, ``TaskSuite`` is what it makes from a config.
 
-The tasks of a :class:`TaskSuite` share one frame shape and one action count, so that one network serves them all.
+The tasks of a ``TaskSuite`` share one frame shape and one action count, so that one network serves them all.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class PublishedScores:
 class Suite:
     """A family of tasks: every fact that the program states about them, and how to make them.
 
-    A subclass states ``name``, ``defaults`` and ``examples`` and implements :meth:`make`; everything else has a
+    A subclass states ``name``, ``defaults`` and ``examples`` and implements ``make``; everything else has a
     default. It must be at the top level of a module, because a run stores it as ``package.module:Name``.
 
     Attributes:

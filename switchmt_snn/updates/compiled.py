@@ -31,7 +31,7 @@ class Compiled(Engine):
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
-        """See :meth:`Engine.unavailable`; compiles something small."""
+        """See ``Engine.unavailable``; compiles something small."""
         reason = super().unavailable(config, device, processes)
         if reason is None and (problem := compile_problem()) is not None:
             reason = f"torch.compile fails on this machine ({problem})"
@@ -44,11 +44,11 @@ class Compiled(Engine):
 
     @classmethod
     def status(cls) -> str:
-        """See :meth:`Engine.status`; compiles something small."""
+        """See ``Engine.status``; compiles something small."""
         return compile_problem() or "works"
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
-        """See :meth:`Engine.values`."""
+        """See ``Engine.values``."""
         return self._passes(observations, next_observations, task, generator)
 
 

@@ -35,18 +35,18 @@ class CudaGraph(Engine):
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
-        """See :meth:`Engine.unavailable`."""
+        """See ``Engine.unavailable``."""
         if device.type != "cuda":
             return f"this one is on device {device.type}"
         return super().unavailable(config, device, processes)
 
     @classmethod
     def status(cls) -> str:
-        """See :meth:`Engine.status`."""
+        """See ``Engine.status``."""
         return "works" if torch.cuda.is_available() else "no CUDA device"
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
-        """See :meth:`Engine.values`."""
+        """See ``Engine.values``."""
         return self._passes(observations, next_observations, task, generator)
 
     def optimizer(self) -> torch.optim.Optimizer:
@@ -54,7 +54,7 @@ class CudaGraph(Engine):
         return adam(self.network, self.config, capturable=True)
 
     def executed(self, step: Step, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> Step:
-        """See :meth:`Engine.executed`."""
+        """See ``Engine.executed``."""
         return GraphedStep(step, optimizer, generator)
 
 

@@ -29,5 +29,5 @@ class Eager(Engine):
         return True
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
-        """See :meth:`Engine.values`."""
+        """See ``Engine.values``."""
         return self._passes(observations, next_observations, task, generator)

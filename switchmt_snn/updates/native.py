@@ -32,7 +32,7 @@ class Native(Engine):
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
-        """See :meth:`Engine.unavailable`; builds the C++ sources if they are not built yet."""
+        """See ``Engine.unavailable``; builds the C++ sources if they are not built yet."""
         if (reason := super().unavailable(config, device, processes)) is not None:
             return reason
         if device.type != "cpu":
@@ -60,7 +60,7 @@ class Native(Engine):
 
     @classmethod
     def status(cls) -> str:
-        """See :meth:`Engine.status`; builds the C++ sources if they are not built yet."""
+        """See ``Engine.status``; builds the C++ sources if they are not built yet."""
         supports = _supports()
         if supports is None:
             return _MISSING
@@ -71,7 +71,7 @@ class Native(Engine):
         return "works" if has_bits else "works, without sums over bits (no AVX-512)"
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
-        """See :meth:`Engine.values`. The choice of the next action shares products with the differentiated pass."""
+        """See ``Engine.values``. The choice of the next action shares products with the differentiated pass."""
         online, target, double_q = self._online, self._target, self.config.double_q
         x_next = target.inputs(next_observations, generator)
         with torch.no_grad():

@@ -1,6 +1,6 @@
-"""An update's three forward passes through a :class:`QNetwork`, for all engines that run PyTorch's operations.
+"""An update's three forward passes through a ``QNetwork``, for all engines that run PyTorch's operations.
 
-One compilation serves all tasks, because a task enters as tensors (:meth:`QNetwork.context`), and all steps, because an
+One compilation serves all tasks, because a task enters as tensors (``QNetwork.context``), and all steps, because an
 update's batch has one size.
 
 Shapes: B batch, A actions.
@@ -20,7 +20,7 @@ Passes = Callable[[Tensor, Tensor, int, torch.Generator], Values]
 """Raw observations and next observations ``[B, *shape]`` of a task, and the encoding's random numbers."""
 
 Encoded = Callable[[Tensor, Tensor, Tensor, Context, Context], Values]
-"""The part of :data:`Passes` that may be compiled: inputs of the three passes, and a task's context of Q and Q*."""
+"""The part of ``Passes`` that may be compiled: inputs of the three passes, and a task's context of Q and Q*."""
 
 
 class DifferentiatedPass(nn.Module):
@@ -49,8 +49,8 @@ def forward_passes(
     Args:
         network: Q; read at every call.
         target: Q*; likewise.
-        differentiated: the pass that has a gradient; see :class:`DifferentiatedPass`.
-        precision: see :func:`~switchmt_snn.spiking.network.synaptic_products`.
+        differentiated: the pass that has a gradient; see ``DifferentiatedPass``.
+        precision: see ``synaptic_products``.
         double_q: whether Q chooses the next action.
         compile_: compiles what needs no random numbers; None leaves it as it is.
     """

@@ -1,6 +1,6 @@
 """Updates that several processes under ``torchrun`` divide: how they talk, and the engine that averages their parts.
 
-The first process runs the whole of Algorithm 1 (:class:`~switchmt_snn.learning.shared_learner.SharedLearner`). For
+The first process runs the whole of Algorithm 1 (``SharedLearner``). For
 every update it deals its batch out in equal parts. Each process computes its part's gradient,
 ``DistributedDataParallel`` averages them, BatchNorm sums its statistics over all processes, and every process takes the
 same Adam step. So the run is that of one process, to rounding. Random encodings are the exception: every process draws
@@ -146,16 +146,16 @@ class Divided(Engine):
         self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q)
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
-        """See :meth:`Engine.values`; of this process's part of a batch."""
+        """See ``Engine.values``; of this process's part of a batch."""
         return self._passes(observations, next_observations, task, generator)
 
     def over_processes(self, mean: Tensor) -> Tensor:
-        """See :meth:`Engine.over_processes`."""
+        """See ``Engine.over_processes``."""
         return self._group.sum(mean) / self._group.size
 
 
 def _normalize_over(group: ProcessGroup, layer: TaskBatchNorm) -> Callable[..., Tensor]:
-    """:meth:`TaskBatchNorm.normalize` that in training normalizes by the statistics of all processes' parts of a batch,
+    """``TaskBatchNorm.normalize`` that in training normalizes by the statistics of all processes' parts of a batch,
     which have one size."""
     alone = layer.normalize
 

@@ -60,7 +60,7 @@ class Engine(ABC):
         target: Q*; likewise.
         config: the learner's settings.
         precision: dtype of the synaptic products; None for float32 (see
-            :func:`~switchmt_snn.spiking.network.synaptic_products`).
+            ``synaptic_products``).
     """
 
     name: ClassVar[str]
@@ -107,7 +107,7 @@ class Engine(ABC):
         """
 
     def optimizer(self) -> torch.optim.Optimizer:
-        """Adam over the parameters of :attr:`network`."""
+        """Adam over the parameters of ``network``."""
         return adam(self.network, self.config)
 
     def executed(self, step: Step, optimizer: torch.optim.Optimizer, generator: torch.Generator) -> Step:
@@ -115,7 +115,7 @@ class Engine(ABC):
 
         Args:
             step: changes tensors in place only, and never waits for the device.
-            optimizer: of :meth:`optimizer`; the step calls it.
+            optimizer: of ``optimizer``; the step calls it.
             generator: whose random numbers the step draws.
         """
         return step

@@ -23,7 +23,7 @@ LIVE_EVERY_S = 0.5
 
 
 class Progress:
-    """An observer that shows where a run stands; see :class:`switchmt_snn.runs.run.Observer`."""
+    """An observer that shows where a run stands; see ``switchmt_snn.runs.run.Observer``."""
 
     def __init__(self, console: Console) -> None:
         self.console = console

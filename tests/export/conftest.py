@@ -27,7 +27,7 @@ CONFIG = {
 
 @pytest.fixture(scope="session")
 def trained_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run that all tests share; only read it, or take :func:`trained_run`."""
+    """The run that all tests share; only read it, or take ``trained_run``."""
     folder = tmp_path_factory.mktemp("trained")
     (folder / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     with pytest.raises(SystemExit) as stop:

@@ -17,7 +17,7 @@ from switchmt_snn.spiking.normalization import TaskBatchNorm
 from switchmt_snn.tasks.registry import make_suite
 
 RunCommand = Callable[..., tuple[str, str]]
-"""See :func:`tests.export.conftest.run_command`."""
+"""See ``tests.export.conftest.run_command``."""
 
 STACKED = {"frame_stack": 4}
 VARIANTS: dict[str, dict[str, Any]] = {

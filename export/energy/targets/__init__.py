@@ -1,1 +1,1 @@
-"""Hardware targets: one YAML file per chip and source (see :mod:`switchmt_snn.export.energy.estimate`)."""
+"""Hardware targets: one YAML file per chip and source (see ``switchmt_snn.export.energy.estimate``)."""

@@ -15,7 +15,7 @@ from switchmt_snn.learning.switching.criterion import EpisodeRecord, Verdict, ch
 
 @dataclass(frozen=True)
 class Stay:
-    """Stay on the task; the rest as in :class:`Verdict`."""
+    """Stay on the task; the rest as in ``Verdict``."""
 
     reason: str
     measured: dict[str, float]
@@ -24,7 +24,7 @@ class Stay:
 
 @dataclass(frozen=True)
 class SwitchTo:
-    """Leave for another task; the rest as in :class:`Verdict`."""
+    """Leave for another task; the rest as in ``Verdict``."""
 
     task: int
     reason: str
@@ -52,7 +52,7 @@ class SwitchingPolicy(Stateful):
         """Make the criterion that the config names.
 
         Raises:
-            ConfigError: the policy is not resolved, unknown, or no criterion (:func:`make_criterion`).
+            ConfigError: the policy is not resolved, unknown, or no criterion (``make_criterion``).
         """
         self.config = config
         self.num_tasks = num_tasks
@@ -94,7 +94,7 @@ class SwitchingPolicy(Stateful):
         return limit is not None and self.num_tasks > 1 and steps_in_visit >= limit
 
     def leave(self, task: int) -> SwitchTo:
-        """The switch that :meth:`must_leave` demands within an episode."""
+        """The switch that ``must_leave`` demands within an episode."""
         return self._next(task, "max_stay_steps", {})
 
     def state_dict(self) -> dict[str, Any]:

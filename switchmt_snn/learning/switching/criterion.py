@@ -1,6 +1,6 @@
 """What a switching criterion is, and the registry of criteria.
 
-A criterion is one subclass of :class:`Criterion` in one file. The class itself states what other parts of the package
+A criterion is one subclass of ``Criterion`` in one file. The class itself states what other parts of the package
 must know: the columns of switches.csv, the memory it takes, the line on the screen.
 """
 
@@ -42,7 +42,7 @@ class EpisodeRecord:
         updates: gradient steps of the whole run.
         episode_return: raw return of the episode.
         parameters: returns theta_t as a vector, a copy that stays as it is. Only a criterion that declares
-            :meth:`Criterion.snapshots` may call it.
+            ``Criterion.snapshots`` may call it.
     """
 
     task: int
@@ -60,7 +60,7 @@ class Verdict:
     Attributes:
         leave: whether learning has levelled off.
         reason: a short name for what decided; a column of switches.csv.
-        measured: every number that the answer rests on, by its name in :attr:`Criterion.columns`.
+        measured: every number that the answer rests on, by its name in ``Criterion.columns``.
         summary: how near the task is to a switch, in a few words for the progress display.
     """
 
@@ -73,12 +73,12 @@ class Verdict:
 class Criterion(Stateful):
     """Decides at each episode's end whether learning on the current task has levelled off.
 
-    A subclass defines :attr:`columns`, its constructor and :meth:`end_of_episode`. ``switching.options`` sets keyword
+    A subclass defines ``columns``, its constructor and ``end_of_episode``. ``switching.options`` sets keyword
     arguments of its constructor; give each a default. Attributes that change are named in ``SAVED`` and the others in
     ``DERIVED``, so that a run resumes exactly.
 
     Attributes:
-        columns: names of the numbers that it reports in :attr:`Verdict.measured`; they are columns of switches.csv.
+        columns: names of the numbers that it reports in ``Verdict.measured``; they are columns of switches.csv.
     """
 
     columns: ClassVar[tuple[str, ...]]
@@ -146,8 +146,8 @@ def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
     """Return the class if it is a whole criterion.
 
     Raises:
-        ConfigError: it is no subclass of :class:`Criterion`, or lacks :attr:`Criterion.columns` or
-            :meth:`Criterion.end_of_episode`, or a column bears a name of :data:`DECISION_COLUMNS`.
+        ConfigError: it is no subclass of ``Criterion``, or lacks ``Criterion.columns`` or
+            ``Criterion.end_of_episode``, or a column bears a name of ``DECISION_COLUMNS``.
     """
     seen = f"switching.policy is {policy!r}"
     if not (isinstance(criterion, type) and issubclass(criterion, Criterion)):

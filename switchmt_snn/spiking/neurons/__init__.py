@@ -52,7 +52,7 @@ def neuron_model(name: str) -> type[NeuronLayer]:
     """The class of a neuron model: registered, or from outside (``package.module:Class``).
 
     Raises:
-        ConfigError: no such model, or the class from outside is no :class:`NeuronLayer`.
+        ConfigError: no such model, or the class from outside is no ``NeuronLayer``.
     """
     if is_plugin(name):
         model = load_plugin(name, "network.neuron")
@@ -70,7 +70,7 @@ def make_neuron_layer(config: NetworkConfig, spiking: bool) -> NeuronLayer:
     """A new layer of the model that ``config.neuron`` names, or of ReLUs for an ANN method.
 
     Raises:
-        ConfigError: see :func:`neuron_model`; or the model does not have a setting's value.
+        ConfigError: see ``neuron_model``; or the model does not have a setting's value.
     """
     return (neuron_model(config.neuron) if spiking else ReLULayer)(config)
 

@@ -93,7 +93,7 @@ class AdaptiveLayer(NeuronLayer):
         return spikes_t, (membrane, adaptation)
 
     def node(self, channels: int) -> AdaptiveNode:
-        """See :class:`AdaptiveNode`."""
+        """See ``AdaptiveNode``."""
         beta, threshold = float(self.beta.detach().clamp(0, 1)), float(self.threshold.detach())
         return AdaptiveNode(
             beta_O=np.full(channels, beta),

@@ -1,6 +1,6 @@
 """What a neuron model gives, and the loop over T simulation steps.
 
-A model is one subclass of :class:`NeuronLayer` in one file. Its :meth:`~NeuronLayer.step` is the equation, written
+A model is one subclass of ``NeuronLayer`` in one file. Its ``step`` is the equation, written
 once; every other form (fused, snnTorch's, C++, ONNX) is tested against it.
 
 Shapes: T simulation steps, B batch, ... any feature shape, O output channels or features.
@@ -23,7 +23,7 @@ from switchmt_snn.spiking.neurons.surrogates import make_surrogate
 from switchmt_snn.spiking.settings import require_known
 
 NeuronState = tuple[Tensor, ...]
-"""State variables ``[B, ...]`` of a layer, in the order of :attr:`NeuronLayer.STATE`."""
+"""State variables ``[B, ...]`` of a layer, in the order of ``NeuronLayer.STATE``."""
 
 Step = Callable[[Tensor, NeuronState], tuple[Tensor, NeuronState]]
 """``(current_t, state) -> (spikes_t, state)``: one simulation step."""
@@ -53,15 +53,15 @@ class OpaqueNode(NeuronNode):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """:attr:`variables`."""
+        """``variables``."""
         return self.variables
 
 
 class NeuronLayer(nn.Module):
     """A layer of neurons: input currents over T steps -> spikes over T steps. The state is passed in and returned.
 
-    A subclass defines :attr:`STATE` and :meth:`step`. It may define :meth:`node`, so that exporters can know it, and
-    :meth:`run`, for a faster form of the same loop.
+    A subclass defines ``STATE`` and ``step``. It may define ``node``, so that exporters can know it, and
+    ``run``, for a faster form of the same loop.
 
     Attributes:
         STATE: names of the state variables.
@@ -116,7 +116,7 @@ class NeuronLayer(nn.Module):
         return self.run(current, self.initial_state(current[0]) if state is None else state)
 
     def run(self, current: Tensor, state: NeuronState) -> tuple[Tensor, NeuronState]:
-        """As :meth:`forward`, from a given state."""
+        """As ``forward``, from a given state."""
         return over_time(self.step, current, state)
 
 

@@ -58,7 +58,7 @@ class LeakyLayer(NeuronLayer):
 
     ``neuron_engine="snntorch"`` calls ``snntorch.Leaky`` step by step. ``"fused"`` does the same float32 arithmetic in
     one autograd function (forward bitwise equal, gradients equal to rounding: tests/spiking/test_neurons.py); under
-    torch.compile it is the loop over :meth:`step`. Learnable beta or threshold, and the stochastic surrogate SSO,
+    torch.compile it is the loop over ``step``. Learnable beta or threshold, and the stochastic surrogate SSO,
     always run through ``snntorch.Leaky``.
 
     Attributes:
@@ -98,7 +98,7 @@ class LeakyLayer(NeuronLayer):
         return self.surrogate(membrane - threshold), (membrane,)
 
     def node(self, channels: int) -> LeakyNode:
-        """See :class:`LeakyNode`."""
+        """See ``LeakyNode``."""
         beta, threshold = float(self.leaky.beta.detach().clamp(0, 1)), float(self.leaky.threshold.detach())
         return LeakyNode(np.full(channels, beta), np.full(channels, threshold), self.reset)
 

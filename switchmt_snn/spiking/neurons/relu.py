@@ -36,7 +36,7 @@ class ReLULayer(NeuronLayer):
         return torch.relu(current_t), state
 
     def node(self, channels: int) -> ReLUNode:
-        """See :class:`ReLUNode`."""
+        """See ``ReLUNode``."""
         return ReLUNode()
 
     def run(self, current: Tensor, state: NeuronState) -> tuple[Tensor, NeuronState]:

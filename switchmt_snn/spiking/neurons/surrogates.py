@@ -44,7 +44,7 @@ def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
     k x < -88 (a membrane 3.6 below the threshold at the default k = 25). Its true value there is 0, and so is ours.
 
     Raises:
-        ConfigError: ``name`` is not in :data:`SURROGATES`.
+        ConfigError: ``name`` is not in ``SURROGATES``.
     """
     require_known("surrogate", name, SURROGATES)
     argument = SURROGATES[name]
@@ -57,7 +57,7 @@ def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
 
 
 def make_surrogate_gradient(name: str, slope: float | None = None) -> SurrogateGradient:
-    """The backward of :func:`make_surrogate`'s surrogate as a function of its own.
+    """The backward of ``make_surrogate``'s surrogate as a function of its own.
 
     snnTorch's backward allocates temporaries of the membranes' size. The usual surrogates work in place here; any other
     one runs its own backward.

@@ -91,7 +91,7 @@ class SynapticLayer(NeuronLayer):
         return self.surrogate(membrane - threshold), (synaptic, membrane)
 
     def node(self, channels: int) -> SynapticNode:
-        """See :class:`SynapticNode`."""
+        """See ``SynapticNode``."""
         alpha, beta, threshold = (
             np.full(channels, float(value.detach()))
             for value in (self.synaptic.alpha, self.synaptic.beta.clamp(0, 1), self.synaptic.threshold)
