@@ -188,13 +188,13 @@ def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
     return Exports(network, decision, step, graphs or None, own)
 
 
-def evaluate_engine(
-    engine: str, run: str | Path | None = None, task: str | None = None, checkpoint: str = "last", **protocol: Any
+def evaluate_exported(
+    runtime: str, run: str | Path | None = None, task: str | None = None, checkpoint: str = "last", **protocol: Any
 ) -> tuple[Evaluation, float]:
-    """Evaluate a run's exported files instead of its network; also written to ``export/evaluation_<engine>.json``.
+    """Evaluate a run's exported files instead of its network; also written to ``export/evaluation_<runtime>.json``.
 
     Args:
-        engine: ``onnx`` (``export/decision.onnx``) or ``nir`` (``export/<task>.nir`` in the reference interpreter).
+        runtime: ``onnx`` (``export/decision.onnx``) or ``nir`` (``export/<task>.nir`` in the reference interpreter).
         run: run folder; None takes the newest under ``runs/``.
         task: one task's name; None evaluates all.
         checkpoint: which weights the share of equal actions refers to.
@@ -204,12 +204,12 @@ def evaluate_engine(
         The scores, and the share of greedy decisions with the trained network's action.
 
     Raises:
-        ExportError: the run was not exported, or its files are of another training step.
+        ExportError: an unknown runtime; the run was not exported, or its files are of another training step.
     """
     folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(folder.path, checkpoint, "cpu")
     suite, config = agent.suite, agent.config
-    played = _engine(folder, engine, suite, config)
+    played = _runtime(folder, runtime, suite, config)
     if played.step != agent.step:
         raise ExportError(
             f"the exported files are of step {played.step}, expected {agent.step} (the {checkpoint} checkpoint); "
@@ -221,21 +221,21 @@ def evaluate_engine(
     evaluation = evaluate_agent(compared, EvaluationProtocol.of(settings, config.tasks), tasks)
     decisions, equal = (sum(column) for column in zip(*compared.compared, strict=True))
     share = equal / decisions
-    facts = {"engine": engine, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
-    write_atomically(folder.path / "export" / f"evaluation_{engine}.json", json.dumps(facts, indent=1).encode())
+    facts = {"runtime": runtime, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
+    write_atomically(folder.path / "export" / f"evaluation_{runtime}.json", json.dumps(facts, indent=1).encode())
     return evaluation, share
 
 
-def load_exported(run: str | Path | None = None, engine: str = "onnx", threads: int = 1) -> OnnxAgent | NirAgent:
+def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads: int = 1) -> OnnxAgent | NirAgent:
     """A run's exported files as an agent: ``q_values(observations, task)`` for raw observations ``[B, ...]``.
 
     Args:
         run: run folder; None takes the newest under ``runs/``.
-        engine: ``onnx``, the fastest way to act on a CPU (docs/performance.md), or ``nir``.
+        runtime: ``onnx``, the fastest way to act on a CPU (docs/performance.md), or ``nir``.
         threads: of onnxruntime. With more than one a decision is faster, and sums may have another order.
 
     Raises:
-        ExportError: the run was not exported.
+        ExportError: an unknown runtime, or the run was not exported.
 
     Example:
         >>> import numpy as np
@@ -248,14 +248,16 @@ def load_exported(run: str | Path | None = None, engine: str = "onnx", threads: 
     """
     folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     config = folder.config()
-    return _engine(folder, engine, make_suite(config.tasks), config, threads)
+    return _runtime(folder, runtime, make_suite(config.tasks), config, threads)
 
 
-def _engine(
-    folder: RunFolder, engine: str, suite: TaskSuite, config: ExperimentConfig, threads: int = 1
+def _runtime(
+    folder: RunFolder, runtime: str, suite: TaskSuite, config: ExperimentConfig, threads: int = 1
 ) -> OnnxAgent | NirAgent:
-    if engine == "onnx":
+    if runtime == "onnx":
         return OnnxAgent(_exported(folder, "decision.onnx", "--onnx"), suite, config, threads)
+    if runtime != "nir":
+        raise ExportError(f"the runtime is {runtime!r}, expected onnx or nir")
     paths = {name: _exported(folder, f"{file_name(name)}.nir", "--nir") for name in suite.names}
     return NirAgent({name: read_nir(path) for name, path in paths.items()}, suite, config)
 

@@ -52,11 +52,15 @@ def to_onnx(
     """
     network = _folded(source, int8)
     index = None if task is None else network.task_index(task)
-    return decision_model(network, index) if kind == "decision" else step_model(network, index)
+    if kind == "decision":
+        return decision_model(network, index)
+    if kind == "step":
+        return step_model(network, index)
+    raise ExportError(f"kind is {kind!r}, expected decision or step")
 
 
 def to_nir(source: Source, task: str, dialect: NirDialect = "portable", int8: bool = False) -> nir.NIRGraph:
-    """One task of a network as a NIR graph; ``write_nir`` writes it.
+    """One task of a network as a NIR graph; ``switchmt_snn.export.write_nir`` writes it.
 
     Args:
         source: see ``Source``.

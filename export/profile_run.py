@@ -20,8 +20,8 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ConfigError, ExportError
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.precision import effect_of_precision
-from switchmt_snn.export.counts.network import TaskCounter, TaskProfile
-from switchmt_snn.export.counts.nir_file import profile_nir
+from switchmt_snn.export.counts.network import TaskCounter, TaskCounts
+from switchmt_snn.export.counts.nir_file import count_nir
 from switchmt_snn.export.energy.estimate import Energy, Target, estimate
 from switchmt_snn.export.energy.traffic import ann_traffic, traffic
 from switchmt_snn.export.folded import fold_agent
@@ -44,7 +44,7 @@ SCHEMA = 2
 
 
 @dataclass(frozen=True)
-class Profile:
+class ProfileResult:
     """A profile that was written.
 
     Attributes:
@@ -64,7 +64,7 @@ def profile(
     checkpoint: str = "last",
     out: str | Path | None = None,
     targets: Sequence[str | Path] = (),
-) -> Profile:
+) -> ProfileResult:
     """Count what a run's network does on recorded decisions of each task; write JSON, CSV and an HTML report.
 
     Args:
@@ -128,8 +128,8 @@ def profile(
 
 def profile_file(
     file: str | Path, observations: str | Path, out: str | Path | None = None, targets: Sequence[str | Path] = ()
-) -> Profile:
-    """``profile`` of a NIR file on stored observations (``switchmt_snn.export.counts.nir_file.profile_nir``).
+) -> ProfileResult:
+    """``profile`` of a NIR file on stored observations (``switchmt_snn.export.counts.nir_file.count_nir``).
 
     Args:
         file: a NIR graph.
@@ -145,14 +145,14 @@ def profile_file(
     if targets and selection.chips:
         names = ", ".join(chip.name for chip in selection.chips)
         raise ConfigError(f"{names} is a chip, expected energy targets for a NIR file; chips are checked for runs")
-    counted = profile_nir(path, Path(observations))
+    counted = count_nir(path, Path(observations))
     folder = _folder(Path(out) if out is not None else path.with_name(f"{path.stem}-profile"))
     facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps, "chips": [], "decisions_per_s": None}
     tasks = [_task_facts(counted, selection.targets, None, None)]
     return _written(folder, (counted,), selection.targets, facts, tasks, ())
 
 
-def compare_profiles(profiles: Iterable[Profile], out: str | Path | None = None) -> Path:
+def compare_profiles(profiles: Iterable[ProfileResult], out: str | Path | None = None) -> Path:
     """Several profiles in one report; ``comparison.json`` and ``comparison.html`` beside the first one's files.
 
     Returns:
@@ -182,12 +182,12 @@ def _folder(folder: Path) -> Path:
 
 def _written(
     folder: Path,
-    profiles: tuple[TaskProfile, ...],
+    profiles: tuple[TaskCounts, ...],
     targets: tuple[Target, ...],
     facts: dict[str, Any],
     tasks: list[dict[str, Any]],
     frames: Frames,
-) -> Profile:
+) -> ProfileResult:
     energies = [(target, estimate(task, target)) for task in profiles for target in targets]
     summary = _summary(profiles, energies)
     facts = {
@@ -204,11 +204,11 @@ def _written(
     write_atomically(folder / "profile.json", json.dumps(facts, indent=1).encode())
     write_atomically(folder / "layers.csv", _layers_csv(profiles).encode())
     write_atomically(folder / "report.html", render_report([facts], [frames], facts["command"]).encode())
-    return Profile(folder, facts, frames)
+    return ProfileResult(folder, facts, frames)
 
 
 def _task_facts(
-    task: TaskProfile,
+    task: TaskCounts,
     targets: tuple[Target, ...],
     evaluation: dict[str, float] | None,
     decisions_per_s: float | None,
@@ -228,7 +228,7 @@ def _task_facts(
     return facts | {"evaluation": evaluation, "energy": energies}
 
 
-def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> TaskProfile:
+def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> TaskCounts:
     """Counts on the recording, or on play that begins like it and is not kept."""
     counter = TaskCounter(agent, task)
     if decisions <= KEPT_DECISIONS:
@@ -236,7 +236,7 @@ def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> T
     else:
         for piece, _ in play_in_pieces(agent, recording.task, decisions, recording.epsilon, recording.seed):
             counter.add(piece.reshape(-1, *agent.suite.observation_shape))
-    return counter.profile()
+    return counter.counts()
 
 
 def _evaluated(run: Path, step: int, task: str) -> dict[str, float] | None:
@@ -282,7 +282,7 @@ def _precision(agent: Agent, task: int, bits: int, recording: Recording) -> dict
     }
 
 
-def _summary(tasks: tuple[TaskProfile, ...], energies: list[tuple[Target, Energy]]) -> dict[str, Any]:
+def _summary(tasks: tuple[TaskCounts, ...], energies: list[tuple[Target, Energy]]) -> dict[str, Any]:
     """Smallest and largest over tasks and targets, and by chip: several sources for one chip give a range."""
     chips: dict[str, list[Energy]] = {}
     for target, energy in energies:
@@ -306,7 +306,7 @@ def _range(values: Iterable[float | None]) -> dict[str, float | None]:
     return {"smallest": min(known, default=None), "largest": max(known, default=None)}
 
 
-def _headline(tasks: tuple[TaskProfile, ...], energies: list[Energy]) -> str:
+def _headline(tasks: tuple[TaskCounts, ...], energies: list[Energy]) -> str:
     """Whether the network costs less than the ANN of its shape, after what makes such a number worthless."""
     dead = [
         f"{layer.name} in {task.task}"
@@ -332,7 +332,7 @@ def _headline(tasks: tuple[TaskProfile, ...], energies: list[Energy]) -> str:
     return f"{warning}The spiking network {costs}."
 
 
-def _layers_csv(tasks: tuple[TaskProfile, ...]) -> str:
+def _layers_csv(tasks: tuple[TaskCounts, ...]) -> str:
     """One row per task, layer and simulation step."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import pkgutil
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from importlinter.cli import lint_imports
@@ -39,3 +42,19 @@ def test_docstrings_have_no_sphinx_roles(path: Path) -> None:
     """The site renders Markdown: write ``name``."""
     roles = (":" + role + ":`" for role in ("func", "class", "meth", "mod", "data", "attr", "exc"))
     assert not any(role in path.read_text() for role in roles), f"{path}: write ``name``, no Sphinx role"
+
+
+def packages() -> list[str]:
+    found = [path.parent.relative_to(ROOT) for path in sources() if path.name == "__init__.py"]
+    return [
+        ".".join(path.parts if path.parts[0] == "switchmt_snn" else ("switchmt_snn", *path.parts)) for path in found
+    ]
+
+
+@pytest.mark.parametrize("package", packages())
+def test_no_name_of_a_package_hides_one_of_its_modules(package: str) -> None:
+    """``import a.b.c`` must give the module c, not a function of that name."""
+    namespace = importlib.import_module(package)
+    for module in pkgutil.iter_modules(namespace.__path__):
+        found = vars(namespace).get(module.name)
+        assert found is None or isinstance(found, ModuleType), f"{package}.{module.name} is a module and {found!r}"

@@ -28,7 +28,7 @@ from switchmt_snn.spiking.layers import Dense, SynapseNode
 
 
 @dataclass(frozen=True)
-class LayerProfile:
+class LayerCounts:
     """Sums over all recorded decisions of one task; ``_T`` are by simulation step.
 
     Attributes:
@@ -106,14 +106,14 @@ class LayerProfile:
 
 
 @dataclass(frozen=True)
-class TaskProfile:
+class TaskCounts:
     """The layers of one task, in forward order."""
 
     task: str
     decisions: int
     timesteps: int
     spiking: bool
-    layers: tuple[LayerProfile, ...]
+    layers: tuple[LayerCounts, ...]
 
     def operations(self, kind: str) -> float:
         """Mean effective operations per decision of a kind, ``AC`` or ``MAC``."""
@@ -207,18 +207,18 @@ class TaskCounter:
                 neuron_counter.add(fired)
             self._chunks += 1
 
-    def profile(self) -> TaskProfile:
+    def counts(self) -> TaskCounts:
         """What has been counted."""
         neurons: list[NeuronCounter | None] = [*self._neurons, None]
         layers = tuple(
-            _layer_profile(self.network, *parts)
+            _layer_counts(self.network, *parts)
             for parts in zip(self.network.synapses, self._synapses, neurons, strict=True)
         )
         name, decisions = self.network.tasks[self.task], self._synapses[0].decisions
-        return TaskProfile(name, decisions, self._steps, self.network.spiking, layers)
+        return TaskCounts(name, decisions, self._steps, self.network.spiking, layers)
 
 
-def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> TaskProfile:
+def count_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> TaskCounts:
     """Count one task's decisions on raw observations ``[N, *shape]``; ``task`` is its index.
 
     Raises:
@@ -226,7 +226,7 @@ def profile_task(agent: Agent, task: int, observations: npt.NDArray[Any]) -> Tas
     """
     counter = TaskCounter(agent, task)
     counter.add(observations)
-    return counter.profile()
+    return counter.counts()
 
 
 def _counted(network: FoldedNetwork, node: SynapseNode, task: int) -> CountedSynapses:
@@ -237,14 +237,14 @@ def _counted(network: FoldedNetwork, node: SynapseNode, task: int) -> CountedSyn
     return CountedSynapses(deployed, spikes_in)
 
 
-def layer_profile(
+def layer_counts(
     counter: SynapseCounter,
     neurons: NeuronCounter | None,
     outputs: int,
     updates: int,
     states: int,
     gain_multiplications: int = 0,
-) -> LayerProfile:
+) -> LayerCounts:
     """What the two counters of a layer hold.
 
     Args:
@@ -255,7 +255,7 @@ def layer_profile(
         states: state variables of one neuron.
         gain_multiplications: per decision.
     """
-    return LayerProfile(
+    return LayerCounts(
         name=counter.synapses.node.name,
         convolution=counter.synapses.shares_weights,
         operation=counter.synapses.operation,
@@ -277,11 +277,11 @@ def layer_profile(
     )
 
 
-def _layer_profile(
+def _layer_counts(
     network: FoldedNetwork, node: SynapseNode, counter: SynapseCounter, neurons: NeuronCounter | None
-) -> LayerProfile:
+) -> LayerCounts:
     steps = network.settings.timesteps
     updates = node.outputs * steps if network.spiking and neurons is not None else 0
     gains = node.outputs * steps if isinstance(node, Dense) and node.gated else 0
     states = next((len(layer.neurons.states) for layer in network.layers if layer.synapses is node), 1)
-    return layer_profile(counter, neurons, node.outputs, updates, states, gains)
+    return layer_counts(counter, neurons, node.outputs, updates, states, gains)

@@ -23,7 +23,7 @@ import torch
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.counts.network import LayerProfile, TaskProfile, layer_profile
+from switchmt_snn.export.counts.network import LayerCounts, TaskCounts, layer_counts
 from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
@@ -42,7 +42,7 @@ _FACTS = ("encoding", "timesteps", "observation_shape", "frame_stack", "scale")
 Array = npt.NDArray[Any]
 
 
-def profile_nir(path: Path, observations: Path) -> TaskProfile:
+def count_nir(path: Path, observations: Path) -> TaskCounts:
     """Count what a NIR file does; the time is that of the interpreter, the memory that of the ``.npz``.
 
     Args:
@@ -80,7 +80,7 @@ def profile_nir(path: Path, observations: Path) -> TaskProfile:
         for layer in layers:
             layer.add(recorded)
     task = str(graph.metadata.get("task", path.stem))
-    return TaskProfile(task, inputs.decisions, inputs.timesteps, True, tuple(layer.profile() for layer in layers))
+    return TaskCounts(task, inputs.decisions, inputs.timesteps, True, tuple(layer.counts() for layer in layers))
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,10 @@ class _Layer:
         if self.spiking is not None and self.neurons is not None:
             self.neurons.add(recorded[self.spiking] != 0)
 
-    def profile(self) -> LayerProfile:
+    def counts(self) -> LayerCounts:
         """What has been counted."""
         updates = self.neurons.spikes_TN.size if self.neurons is not None else 0
-        return layer_profile(self.synapses, self.neurons, self.outputs, updates, self.states)
+        return layer_counts(self.synapses, self.neurons, self.outputs, updates, self.states)
 
 
 def _layers(interpreter: NirInterpreter, inputs: _Inputs) -> list[_Layer]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.errors import ConfigError, did_you_mean
-from switchmt_snn.export.counts.network import LayerProfile, TaskProfile
+from switchmt_snn.export.counts.network import LayerCounts, TaskCounts
 from switchmt_snn.export.energy.traffic import Traffic, ann_traffic, traffic
 from switchmt_snn.export.yaml_files import SUFFIXES, Section, builtin_files, check_number, file_text, parse
 
@@ -147,7 +147,7 @@ class Energy:
         }
 
 
-def estimate(task: TaskProfile, target: Target) -> Energy:
+def estimate(task: TaskCounts, target: Target) -> Energy:
     """Energy of a task's mean decision."""
     unpriced: list[str] = []
     layers = tuple(_layer_energy(layer, task.spiking, target, unpriced) for layer in task.layers)
@@ -162,7 +162,7 @@ def estimate(task: TaskProfile, target: Target) -> Energy:
     )
 
 
-def _ann_pj(task: TaskProfile, target: Target, quantised: bool = False) -> float | None:
+def _ann_pj(task: TaskCounts, target: Target, quantised: bool = False) -> float | None:
     """Energy of the ANN of the same shape, or of its twin with activations of few bits."""
     mac = target.operations_pj.get("mac")
     if mac is None:
@@ -182,7 +182,7 @@ def _ann_pj(task: TaskProfile, target: Target, quantised: bool = False) -> float
     return total
 
 
-def _layer_energy(layer: LayerProfile, spiking: bool, target: Target, unpriced: list[str]) -> LayerEnergy:
+def _layer_energy(layer: LayerCounts, spiking: bool, target: Target, unpriced: list[str]) -> LayerEnergy:
     prices = target.operations_pj
     if layer.operation == "MAC":
         charges = [(layer.effective_per_decision, prices.get("mac"), "multiplications")]
@@ -201,7 +201,7 @@ def _layer_energy(layer: LayerProfile, spiking: bool, target: Target, unpriced: 
     return LayerEnergy(layer.name, compute, memory)
 
 
-def _memory_pj(accesses: Traffic, layer: LayerProfile, memory: Memory) -> dict[str, float]:
+def _memory_pj(accesses: Traffic, layer: LayerCounts, memory: Memory) -> dict[str, float]:
     """Energy of memory accesses: each from the smallest memory that holds what lies there."""
     smallest = memory.access_pj(1, memory.state_bits)
     return {

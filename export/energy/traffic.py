@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from switchmt_snn.export.counts.network import LayerProfile
+from switchmt_snn.export.counts.network import LayerCounts
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Traffic:
     state: float
 
 
-def traffic(layer: LayerProfile, spiking: bool) -> Traffic:
+def traffic(layer: LayerCounts, spiking: bool) -> Traffic:
     """Of a layer as it was counted; ``spiking`` tells whether its network's neurons spike."""
     accumulates = layer.operation == "AC"
     passes = len(layer.effective_T)
@@ -54,7 +54,7 @@ def traffic(layer: LayerProfile, spiking: bool) -> Traffic:
     )
 
 
-def ann_traffic(layer: LayerProfile) -> Traffic:
+def ann_traffic(layer: LayerCounts) -> Traffic:
     """Of the same layer in the ANN of the same shape."""
     macs = layer.macs_of_ann_twin
     inputs = macs if layer.convolution else layer.inputs

@@ -45,7 +45,7 @@ class Trace:
 
 @dataclass
 class Comparison:
-    """Decisions of an engine against those of the trained network.
+    """Decisions of a runtime against those of the trained network.
 
     Attributes:
         spikes: by layer, in forward order: of the trained network.
@@ -56,7 +56,7 @@ class Comparison:
         equal_actions: decisions with the same greedy action.
     """
 
-    engine: str
+    runtime: str
     task: str
     decisions: int = 0
     spikes: dict[str, int] = field(default_factory=dict)
@@ -191,7 +191,7 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
     name, network = agent.suite.names[task], exports.network
     own = OnnxAgent(exports.own_decisions[name], agent.suite, agent.config) if name in exports.own_decisions else None
     there = {"onnx": exports.decision, "onnx, one task": own, "nir": exports.graphs}
-    engines = [engine for engine, model in there.items() if model is not None]
+    runtimes = [runtime for runtime, model in there.items() if model is not None]
     decision = OnnxAgent(exports.decision, agent.suite, agent.config) if exports.decision is not None else None
     step = onnx_session(exports.step) if exports.step is not None else None
 
@@ -200,17 +200,17 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
         mine = Agent(copy.deepcopy(agent.network), agent.suite, agent.config, agent.device, agent.step)
         expected = trace_torch(mine, chunk, task, seed)
         encoded_TB = encode(agent.suite, agent.config, chunk, seed)
-        results = [Comparison(engine, name) for engine in engines]
+        results = [Comparison(runtime, name) for runtime in runtimes]
         for result in results:
-            if result.engine == "onnx" and decision is not None:
+            if result.runtime == "onnx" and decision is not None:
                 result.add(expected, trace_onnx(network, decision, step, chunk, encoded_TB, task))
-            elif result.engine == "onnx, one task" and own is not None:
+            elif result.runtime == "onnx, one task" and own is not None:
                 result.add(expected, trace_onnx(network, own, None, chunk, encoded_TB, task))
             elif exports.graphs is not None:
                 result.add(expected, trace_nir(network, exports.graphs[name], encoded_TB, task))
         return results
 
-    totals = [Comparison(engine, name) for engine in engines]
+    totals = [Comparison(runtime, name) for runtime in runtimes]
     with all_cores() as pool:
         for results in pool.map(compared, *zip(*enumerate(chunks(observations)), strict=True)):
             for total, result in zip(totals, results, strict=True):

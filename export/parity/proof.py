@@ -60,7 +60,7 @@ class _Proof:
                 real.append(comparison.to_dict())
                 if not self.int8 and comparison.equal_actions_share < MIN_EQUAL_ACTIONS:
                     self.failures.append(
-                        f"{names[task]}, {comparison.engine}: {comparison.equal_actions_share:.1%} equal actions, "
+                        f"{names[task]}, {comparison.runtime}: {comparison.equal_actions_share:.1%} equal actions, "
                         f"first difference in layer {comparison.first_difference}"
                     )
             if self.int8 and self.written.decision is not None:
@@ -74,7 +74,7 @@ class _Proof:
                 dyadic.append(comparison.to_dict() | {"exact_arithmetic": exact})
                 if exact and not self._agrees(comparison):
                     self.failures.append(
-                        f"{name}, {comparison.engine}: not bitwise equal on exact numbers, first in layer "
+                        f"{name}, {comparison.runtime}: not bitwise equal on exact numbers, first in layer "
                         f"{comparison.first_difference}"
                     )
         simulators, left_out = [], {}

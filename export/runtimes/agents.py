@@ -171,30 +171,30 @@ class NirAgent:
 
 
 class ComparedAgent:
-    """An engine that plays while the trained network is asked about the same observations.
+    """A runtime that plays while the trained network is asked about the same observations.
 
     Attributes:
         compared: for every batch of greedy decisions, how many there were, and how many had the same action.
     """
 
-    def __init__(self, engine: DecisionMaker, reference: Agent) -> None:
-        self.engine, self.reference = engine, reference
-        self.suite, self.step = engine.suite, engine.step
+    def __init__(self, runtime: DecisionMaker, reference: Agent) -> None:
+        self.runtime, self.reference = runtime, reference
+        self.suite, self.step = runtime.suite, runtime.step
         self.compared: list[tuple[int, int]] = []
 
     def independent(self) -> ComparedAgent:
         """Both for another thread; what is compared there is counted here as well."""
-        other = ComparedAgent(self.engine.independent(), self.reference.independent())
+        other = ComparedAgent(self.runtime.independent(), self.reference.independent())
         other.compared = self.compared
         return other
 
     def reseed(self, seed: int) -> None:
         """Restart both."""
-        self.engine.reseed(seed)
+        self.runtime.reseed(seed)
         self.reference.reseed(seed)
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
-        """The engine's Q-values; the comparison is counted."""
-        values, expected = self.engine.q_values(observation, task), self.reference.q_values(observation, task)
+        """The runtime's Q-values; the comparison is counted."""
+        values, expected = self.runtime.q_values(observation, task), self.reference.q_values(observation, task)
         self.compared.append((len(values), int((values.argmax(axis=1) == expected.argmax(axis=1)).sum())))
         return values

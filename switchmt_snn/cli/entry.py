@@ -256,10 +256,10 @@ def _evaluate(argv: list[str]) -> int:
     if options.engine == "torch":
         evaluation, facts = evaluate(path, options.task, options.checkpoint, **protocol), {}
     else:
-        from switchmt_snn.export.export_run import evaluate_engine
+        from switchmt_snn.export.export_run import evaluate_exported
 
-        evaluation, share = evaluate_engine(options.engine, path, options.task, options.checkpoint, **protocol)
-        facts = {"engine": options.engine, "equal_actions_share": share}
+        evaluation, share = evaluate_exported(options.engine, path, options.task, options.checkpoint, **protocol)
+        facts = {"runtime": options.engine, "equal_actions_share": share}
     if options.json:
         print(json.dumps({"run": str(path), **facts, **evaluation.to_dict()}))
         return 0
@@ -306,7 +306,7 @@ def _export(argv: list[str]) -> int:
 def _profile(argv: list[str]) -> int:
     names, rest = _leading_names(argv)
     options = _parse(ProfileOptions, rest, "profile", ProfileOptions())
-    from switchmt_snn.export import Profile, compare_profiles, profile, profile_file
+    from switchmt_snn.export import ProfileResult, compare_profiles, profile, profile_file
     from switchmt_snn.runs.folder import RunFolder
 
     files = [name for name in names if name.endswith(".nir")]
@@ -319,7 +319,7 @@ def _profile(argv: list[str]) -> int:
         raise ConfigError("--decisions and --checkpoint are for runs, expected neither with a NIR file; leave them out")
     for path in set(names) - set(files):  # all of them, before the first is profiled
         RunFolder(Path(path)).require()
-    profiles: list[Profile] = []
+    profiles: list[ProfileResult] = []
     # With several, --out is the comparison's; each one's own files lie in its own folder.
     out = options.out if len(names) < 2 else None
     chosen: list[str | None] = [*names] or [None]  # None is the newest run

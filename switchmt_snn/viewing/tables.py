@@ -82,7 +82,7 @@ def parity_table(parity: dict[str, Any]) -> Table:
         "may flip a spike; flips: decisions with at least one, actions: share of equal ones, |dQ|: largest difference. "
         "bitwise: every spike and every Q-value.",
     )
-    _add_columns(table, ("check", "task", "engine"), ("n", "flips", "|dQ|", "actions", "bitwise"))
+    _add_columns(table, ("check", "task", "runtime"), ("n", "flips", "|dQ|", "actions", "bitwise"))
     for check, rows in (("exact", parity["dyadic"]), ("play", parity["recorded"])):
         for row in rows:
             share, flips = row["equal_actions_share"], row["decisions_with_flips"]
@@ -95,7 +95,7 @@ def parity_table(parity: dict[str, Any]) -> Table:
                 f"{share:.1%}" if share < 1 else "all",
                 _yes(row["bitwise"]),
             )
-            table.add_row(check, row["task"], row["engine"], *numbers)
+            table.add_row(check, row["task"], row["runtime"], *numbers)
     for row in parity["simulators"]:
         n = f"{row['decisions']:,}"
         verdict = "refused" if row["refused"] else _yes(row["bitwise"])

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.export.counts.network import LayerProfile, TaskProfile
+from switchmt_snn.export.counts.network import LayerCounts, TaskCounts
 from switchmt_snn.export.energy.estimate import Memory, Target, builtin_targets, estimate, load_target, read_target
 from switchmt_snn.export.energy.traffic import traffic
 from switchmt_snn.export.yaml_files import parse
@@ -20,10 +20,10 @@ TEXTS = dict.fromkeys(("name", "title", "chip", "process", "source", "includes",
 TARGET = {**TEXTS, "evidence": "measured", "unit": "pJ", "operations": {"ac": 2.0, "mac": 10.0, "neuron_update": 3.0}}
 
 
-def layer(name: str, operation: str, effective: int, dense: int, neurons: int, spikes: int, conv=False) -> LayerProfile:
+def layer(name: str, operation: str, effective: int, dense: int, neurons: int, spikes: int, conv=False) -> LayerCounts:
     """Ten decisions of two steps; a first layer works once."""
     steps = 1 if operation == "MAC" else 2
-    return LayerProfile(
+    return LayerCounts(
         name=name,
         convolution=conv,
         operation=operation,
@@ -45,7 +45,7 @@ def layer(name: str, operation: str, effective: int, dense: int, neurons: int, s
     )
 
 
-TASK = TaskProfile(
+TASK = TaskCounts(
     "game",
     10,
     2,

@@ -142,7 +142,7 @@ def test_a_broken_export_is_caught_and_the_layer_named() -> None:
         graphs = {"asterix": nir_graph(wrong, 1)}
         written = Exports(wrong, model, step_model(wrong).SerializeToString(), graphs, {"asterix": own})
         comparisons = compare(agent, written, 1, x)
-        assert [comparison.engine for comparison in comparisons] == ["onnx", "onnx, one task", "nir"]
+        assert [comparison.runtime for comparison in comparisons] == ["onnx", "onnx, one task", "nir"]
         for comparison in comparisons:
             assert not comparison.bitwise
             assert comparison.first_difference == name
@@ -218,7 +218,7 @@ def test_legacy_with_subtract_needs_the_rule_from_the_metadata() -> None:
     agent = dyadic_copy(make_agent(reset="subtract"))
     x = dyadic_observations(observations(agent, 16))
     written = exports(agent, "legacy")
-    (nir_comparison,) = [c for c in compare(agent, written, 0, x) if c.engine == "nir"]
+    (nir_comparison,) = [c for c in compare(agent, written, 0, x) if c.runtime == "nir"]
     assert nir_comparison.bitwise
     graph = written.graphs["breakout"]
     encoded = encode(agent.suite, agent.config, x, 0)

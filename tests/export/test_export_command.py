@@ -29,7 +29,7 @@ def test_export_writes_checks_and_the_files_play(trained_run: Path, run_command:
     assert parity["failures"] == []
     assert all(row["bitwise"] and row["exact_arithmetic"] for row in parity["dyadic"])
     assert all(total > 0 for row in parity["dyadic"] for total in row["spikes"].values())
-    assert [(row["task"], row["engine"], row["decisions"]) for row in parity["recorded"]] == [
+    assert [(row["task"], row["runtime"], row["decisions"]) for row in parity["recorded"]] == [
         ("breakout", "onnx", 200),
         ("breakout", "nir", 200),
         ("asterix", "onnx", 200),
@@ -147,6 +147,6 @@ def test_the_same_from_python(trained_run: Path) -> None:
     bare = agent.network
     result = check_parity(bare, {"task_0": observations["breakout"], "task_1": observations["asterix"]})
     assert result["failures"] == []
-    assert {row["engine"] for row in result["recorded"]} == {"onnx", "nir"}
+    assert {row["runtime"] for row in result["recorded"]} == {"onnx", "nir"}
     with pytest.raises(ExportError, match="pass observations="):
         check_parity(bare)

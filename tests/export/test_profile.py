@@ -19,7 +19,7 @@ from switchmt_snn.config import METHOD_TRAITS
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export import profile, provenance
 from switchmt_snn.export.chips.precision import at_precision, effect_of_precision
-from switchmt_snn.export.counts.network import profile_task
+from switchmt_snn.export.counts.network import count_task
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.runs.run import load_agent
 from tests.export.export_cases import VARIANTS, RunCommand, make_agent, observations
@@ -63,7 +63,7 @@ def test_counts_equal_hooks_on_the_network(variant: str) -> None:
                 module.weight *= torch.rand_like(module.weight) > 0.3
     x = observations(agent, 60)
     for task in range(3):
-        profile = profile_task(agent, task, x)
+        profile = count_task(agent, task, x)
         expected = hooked_counts(agent, x, task)
         seen = {layer.name: sum(layer.effective_T) for layer in profile.layers}
         for name, count in expected.items():
@@ -82,7 +82,7 @@ def test_counts_equal_hooks_on_the_network(variant: str) -> None:
 def test_what_is_a_multiplication_and_what_an_accumulation() -> None:
     def kinds(variant: str) -> list[str]:
         agent = make_agent(**VARIANTS[variant])
-        return [layer.operation for layer in profile_task(agent, 0, observations(agent, 5)).layers]
+        return [layer.operation for layer in count_task(agent, 0, observations(agent, 5)).layers]
 
     assert kinds("SwitchMT") == ["MAC", "AC", "AC"]
     assert kinds("frames") == ["MAC", "AC", "AC"]
@@ -95,8 +95,8 @@ def test_what_is_a_multiplication_and_what_an_accumulation() -> None:
 def test_sums_do_not_depend_on_the_chunks_or_the_batch() -> None:
     agent = make_agent()
     x = observations(agent, 130)
-    whole = profile_task(agent, 1, x)
-    parts = [profile_task(agent, 1, part) for part in (x[:64], x[64:65], x[65:])]
+    whole = count_task(agent, 1, x)
+    parts = [count_task(agent, 1, part) for part in (x[:64], x[64:65], x[65:])]
     for index, layer in enumerate(whole.layers):
         assert sum(sum(part.layers[index].effective_T) for part in parts) == sum(layer.effective_T)
         assert sum(sum(part.layers[index].spikes_T) for part in parts) == sum(layer.spikes_T)
@@ -108,15 +108,15 @@ def test_the_ann_twin_is_the_dense_network_once() -> None:
     spiking, ann = (make_agent(method=method) for method in ("SwitchMT", "DQN_D"))
     x = observations(spiking, 5)
     macs = 16 * 6 * 9 * 64 + 1024 * 64 + 64 * 6
-    assert profile_task(spiking, 0, x).dense_macs_of_ann_twin == macs
-    assert sum(layer.dense_per_decision for layer in profile_task(ann, 0, x).layers) == macs
+    assert count_task(spiking, 0, x).dense_macs_of_ann_twin == macs
+    assert sum(layer.dense_per_decision for layer in count_task(ann, 0, x).layers) == macs
 
 
 def test_wrong_observations_are_refused() -> None:
     agent = make_agent()
     for wrong in (np.zeros((0, *agent.suite.observation_shape), np.uint8), np.zeros((3, 2, 10, 10), np.uint8)):
         with pytest.raises(ExportError, match="recorded observations have shape"):
-            profile_task(agent, 0, wrong)
+            count_task(agent, 0, wrong)
 
 
 def test_profile_command(trained_run: Path, run_command: RunCommand) -> None:
