@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow  # environments are made
+
 ROOT = Path(__file__).parents[1]
 CHECK = """
 import importlib.resources as r, sys

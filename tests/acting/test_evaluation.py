@@ -54,6 +54,7 @@ def test_every_episode_is_played_once_with_its_own_seed() -> None:
     assert {score.truncated for score in scores} == {score.seed % 2 == 0 for score in scores}
 
 
+@pytest.mark.slow
 def test_deterministic_for_a_seed() -> None:
     one, two = (evaluate_agent(minatar_agent(), PROTOCOL) for _ in range(2))
     assert one == two
@@ -61,6 +62,7 @@ def test_deterministic_for_a_seed() -> None:
     assert [e.score for e in other.episodes] != [e.score for e in one.episodes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("encoding", "engine"), [("direct", "fused"), ("rate", "fused"), ("direct", "snntorch")])
 def test_threads_play_what_one_after_the_other_plays(encoding: str, engine: str, monkeypatch) -> None:
     """snnTorch's neurons write into themselves and random encodings draw: neither is shared between threads."""
@@ -76,6 +78,7 @@ def test_threads_play_what_one_after_the_other_plays(encoding: str, engine: str,
     assert evaluate_agent(agent, PROTOCOL) == threads
 
 
+@pytest.mark.slow
 def test_scores_do_not_depend_on_how_many_play_side_by_side() -> None:
     """The random policy exactly: an episode is its seed's alone."""
     agent = minatar_agent()

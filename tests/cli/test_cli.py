@@ -65,6 +65,7 @@ def test_describe_table_names_every_method(capsys) -> None:
         assert method in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_trains_on_atari(method: str, tmp_path: Path, capsys) -> None:
     run = tmp_path / "run"
@@ -82,6 +83,7 @@ def test_every_method_trains_on_atari(method: str, tmp_path: Path, capsys) -> No
     assert tasks[:3] == ["pong", "breakout", "enduro"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", POLICIES)
 def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path: Path, capsys) -> None:
     run = tmp_path / "run"
@@ -113,6 +115,7 @@ def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path
     assert any(all(row[column] for column in numbers[policy]) for row in rows), rows
 
 
+@pytest.mark.slow
 def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     code, out, _ = call(capsys, "train", "--json", *SMALL)
@@ -210,6 +213,7 @@ def test_importing_the_package_is_light() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.slow
 def test_gym_tasks_from_a_file(tmp_path: Path, capsys) -> None:
     """Two Gymnasium ids of different shapes and action counts in one spiking network."""
     path = tmp_path / "two.yaml"

@@ -125,6 +125,7 @@ def test_switching_decisions_equal_the_one_file_decisions(seed: int) -> None:
     assert 5 < left < 60, "the walk must make the policy both stay and leave"
 
 
+@pytest.mark.slow
 def test_one_file_runs_from_the_command_line_arguments() -> None:
     scores = one_file.main(["--steps", "400", "--hidden", "8"])
     assert set(scores) == {"Catch", "Dodge"}

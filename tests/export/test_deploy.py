@@ -66,6 +66,7 @@ def test_the_host_sees_what_the_agent_saw_in_training() -> None:
     game.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["norse", "spikingjelly", "sinabs"])
 def test_programs_for_other_simulators(name: str, tmp_path: Path) -> None:
     simulator = SIMULATORS[name]

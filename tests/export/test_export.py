@@ -69,6 +69,7 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
         assert all(total > 0 for total in totals.values()), f"a silent layer proves nothing: {totals}"
 
 
+@pytest.mark.slow
 @settings(max_examples=int(os.environ.get("EXPORT_EXAMPLES", "20")), deadline=None)
 @given(
     method=st.sampled_from(METHODS),
@@ -103,6 +104,7 @@ def test_any_network_is_exported_bitwise(
             assert comparison.bitwise, comparison
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_real_weights_decide_alike(variant: str) -> None:
     agent = make_agent(**VARIANTS[variant])

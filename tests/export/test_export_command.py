@@ -11,6 +11,7 @@ import pytest
 from tests.export.export_cases import RunCommand
 
 
+@pytest.mark.slow
 def test_export_writes_checks_and_the_files_play(trained_run: Path, run_command: RunCommand) -> None:
     out, _ = run_command("export", trained_run, "--onnx", "--nir", "--task", "asterix", "--parity-decisions", 200)
     assert "Parity with the trained network" in out

@@ -161,6 +161,7 @@ OWN = ["DSQN", "DSQN_D", "MTSpark_AD", "SwitchMT", "rate", "latency", "frames", 
 OWN += ["LIF subtract", "Synaptic subtract", "per_neuron", "mlp", "T 7", "T 1", "last_membrane"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", OWN)
 def test_own_files_count_like_the_network(variant: str, exported, tmp_path: Path) -> None:
     agent, x, path = exported(variant)

@@ -152,6 +152,7 @@ def test_chips_and_targets_are_chosen_by_name(trained_run: Path, run_command: Ru
     assert "xylo-audio-3" in err, "all of them"
 
 
+@pytest.mark.slow
 def test_a_chip_of_ones_own_is_checked(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     """From the command line and from Python: a small copy of a built-in chip with weights of 4 bits."""
     text = (Path(__file__).parents[2] / "export" / "chips" / "builtin" / "loihi-1.yaml").read_text()
@@ -194,6 +195,7 @@ def test_energy_per_episode_needs_an_evaluation_at_this_step(trained_run: Path) 
     assert (task["evaluation"], task["energy"][0]["per_episode_pj"]) == (None, None)
 
 
+@pytest.mark.slow
 def test_decisions_are_the_same_from_a_longer_recording(trained_run: Path) -> None:
     def counts(decisions: int) -> list:
         return [task["layers"] for task in profile(trained_run, decisions=decisions).facts["tasks"]]
@@ -205,6 +207,7 @@ def test_decisions_are_the_same_from_a_longer_recording(trained_run: Path) -> No
     assert counts(60) == first
 
 
+@pytest.mark.slow
 def test_long_profiles_count_while_they_play(trained_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = profile(trained_run, decisions=400).facts["tasks"]
     shutil.rmtree(trained_run / "recordings")

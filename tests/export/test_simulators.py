@@ -18,6 +18,7 @@ from tests.export.export_cases import make_agent, observations
 CASES = [(name, "portable") for name in SIMULATORS] + [("spikingjelly", "spikingjelly")]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("name", "profile"), CASES)
 @pytest.mark.parametrize("method", ["SwitchMT", "DSQN"])

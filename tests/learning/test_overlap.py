@@ -56,6 +56,7 @@ def training(overlap: bool) -> Training:
     return Training(config, make_suite(config.tasks), torch.device("cpu"))
 
 
+@pytest.mark.slow
 def test_the_other_thread_changes_nothing_at_any_step(monkeypatch: pytest.MonkeyPatch) -> None:
     trainings = [training(overlap=True) for _ in range(3)]
     monkeypatch.setattr(trainings[1], "_step_on_thread", immediately)
@@ -105,6 +106,7 @@ def test_the_environments_step_while_the_update_runs(monkeypatch: pytest.MonkeyP
     assert met[0]
 
 
+@pytest.mark.slow
 def test_without_overlap_the_paper_order_stays() -> None:
     """Other parameters, because an update samples with the newest transition, and acts come after it."""
     plain, beside = training(overlap=False), training(overlap=True)

@@ -35,6 +35,7 @@ def run(training: Training) -> list[Any]:
     return list(training.events())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize("update_tasks", ["current", "all"])
 def test_batches_never_mix_tasks_or_cross_episodes(num_envs: int, update_tasks: str, monkeypatch) -> None:
@@ -102,6 +103,7 @@ def test_steps_episodes_and_updates_add_up() -> None:
     assert due - 2 * -(-21 // 3) <= training.learner.updates < due
 
 
+@pytest.mark.slow
 def test_a_task_that_is_left_pauses_and_goes_on() -> None:
     """Visits of 4 steps, episodes of 7: each one ends in a later visit than it began in, and none is lost."""
     training = counting(small_config(tasks={"num_envs": 3}, switching={"max_stay_steps": 12}))
@@ -113,6 +115,7 @@ def test_a_task_that_is_left_pauses_and_goes_on() -> None:
         assert training.starts_by_task[task] - training.episodes_by_task[task] in (0, 3), "only running ones are open"
 
 
+@pytest.mark.slow
 def test_epsilon_counts_the_steps_it_is_told_to() -> None:
     for clock, expected in (("total", 0.1), ("task", 0.19)):
         training = counting(small_config(total_steps=200, learning={"epsilon_clock": clock}))
@@ -134,6 +137,7 @@ def test_clocks_survive_any_step_size() -> None:
         assert rounds == total // 7
 
 
+@pytest.mark.slow
 def test_every_attribute_is_saved_or_declared_derived() -> None:
     """Walks all parts of a run: an attribute that is neither would be lost by a resume."""
     seen = set()
@@ -159,6 +163,7 @@ def test_every_attribute_is_saved_or_declared_derived() -> None:
     assert len(seen) == 4 + len(POLICIES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", POLICIES)
 def test_state_dict_continues_exactly(policy: str) -> None:
     """At any step: a new Training with the state of an old one goes on bitwise the same."""
@@ -201,18 +206,21 @@ def contradiction(method: str, dendrites: str, seed: int) -> float:
     return float(np.mean([training.learner.act(observation, task)[0] == task for task in range(2)]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("dendrites", ["shared", "per_neuron"])
 def test_contradicting_tasks_are_solved_with_dendrites(dendrites: str, seed: int) -> None:
     assert contradiction("SwitchMT", dendrites, seed) == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("method", ["DSQN", "DSQN_D", "DQN_D"])
 def test_contradicting_tasks_stay_at_chance_without_dendrites(method: str, seed: int) -> None:
     assert contradiction(method, "auto", seed) == 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_learns_the_identity_task(method: str) -> None:
     """One task, the observation says the action."""
@@ -302,6 +310,7 @@ def recorded_on() -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 def test_measured_names_every_layer() -> None:
     measured = [e for e in run(counting(small_config())) if isinstance(e, Measured)]
     assert len(measured) == 8

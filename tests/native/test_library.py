@@ -13,6 +13,7 @@ from switchmt_snn.native import library as native_library
 NATIVE = Path(native_library.__file__).parent
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(native_library.problem() is not None, reason="no C++ compiler")
 def test_a_library_is_built_once_and_again_if_it_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

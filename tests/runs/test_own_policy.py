@@ -56,6 +56,7 @@ def rows(run: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((run / "switches.csv").read_text().splitlines()))
 
 
+@pytest.mark.slow
 def test_a_policy_from_outside_trains_and_continues_in_a_fresh_process(folder: Path) -> None:
     """Half of the steps here, the rest by ``train --run`` on the command line: the same as in one go."""
     own = import_module("my_policies").ReturnAbove

@@ -23,6 +23,8 @@ import torch
 
 from switchmt_snn.updates.compiled import compile_problem
 
+pytestmark = pytest.mark.slow  # processes are started and killed
+
 COMMAND = [sys.executable, "-m", "switchmt_snn"]
 CONFIG = """
 name: resume

@@ -15,7 +15,7 @@ from switchmt_snn.config import ExperimentConfig, SuiteDefaults, TasksConfig, re
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import ConfigError, TaskError
 from switchmt_snn.learning.training import observation_spec
-from switchmt_snn.runs.folder import describe_environment
+from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.check import check_suite
 from switchmt_snn.tasks.registry import SUITES, find_suite, make_suite, register_suite, suite_of
@@ -34,6 +34,7 @@ def test_the_config_knows_every_suite_and_its_defaults() -> None:
     assert [suite.name for suite in SUITES.values()] == list(SUITES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_environments_do_what_their_suite_says(name: str) -> None:
     """Shape, type and range of frames, valid actions, and the same episode for the same seed and actions."""

@@ -18,6 +18,7 @@ from tests.conftest import CountingEnvironment, vector_suite
 gymnasium.register_envs(ale_py)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("game", "name"), [("pong", "Pong"), ("breakout", "Breakout"), ("enduro", "Enduro")])
 def test_atari_equals_gymnasium_with_the_standard_wrappers(game: str, name: str) -> None:
     """Same actions: equal stacks, rewards and terminations, episode for episode.
@@ -76,6 +77,7 @@ SUITES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suite_name", SUITES)
 def test_an_episode_is_a_function_of_seed_and_actions(suite_name: str) -> None:
     """A restored play has the same observations as the one that went on, and goes on the same."""

@@ -73,6 +73,7 @@ compiles = pytest.mark.skipif(compiled.compile_problem() is not None, reason="no
 builds = pytest.mark.skipif(not ENGINES["native"].status().startswith("works"), reason="no C++ compiler")
 
 
+@pytest.mark.slow
 @compiles
 @pytest.mark.parametrize(
     "network",
@@ -122,6 +123,7 @@ def _compare_to_rounding(engine: str, network: dict[str, Any]) -> None:
         assert all(ours[name].any() for name in ours if name.endswith("head.weight")), "no hidden neuron fires"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("engine", "trunk", "has_amx"),
     [
@@ -231,6 +233,7 @@ def test_bfloat16_instructions_are_those_that_the_system_lists() -> None:
     assert machine.has_bfloat16(CPU) == ("avx512_bf16" in flags or "amx_tile" in flags)
 
 
+@pytest.mark.slow
 def test_freed_memory_is_kept_where_the_c_library_can() -> None:
     """In a process of its own: once it has what it needs, large allocations take no new pages."""
     code = """

@@ -18,6 +18,8 @@ from tests.conftest import small_config
 from tests.runs.test_resume import CONFIG, content
 from tests.updates.processes_case import config, outcome
 
+pytestmark = pytest.mark.slow  # torchrun
+
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone", "-m", "--"]
 
 
