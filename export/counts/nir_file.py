@@ -28,8 +28,7 @@ from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, 
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
-from switchmt_snn.spiking.encodings import Encoder
-from switchmt_snn.spiking.folding import SPIKE_ENCODINGS
+from switchmt_snn.spiking.encodings import ENCODINGS, make_encoding
 from switchmt_snn.spiking.layers import Conv, Dense, convolved_sides
 
 _SYNAPTIC = (nir.Conv2d, nir.Affine, nir.Linear)
@@ -236,12 +235,17 @@ def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
             f"{float(facts['scale']):.4g}); store them as they were seen"
         )
     encoding, timesteps, scale = str(facts["encoding"]), int(facts["timesteps"]), float(facts["scale"])
+    if encoding not in ENCODINGS:  # a file may not name code to import
+        raise ExportError(
+            f"the NIR graph's encoding is {encoding!r}, expected one of {', '.join(ENCODINGS)}; store encoded inputs "
+            "as 'inputs' instead"
+        )
     if encoding == "events" and "event_threshold" not in facts:
         raise ExportError("the NIR graph's metadata has no event_threshold, expected it for events; export again")
     threshold = float(facts.get("event_threshold", NetworkConfig.event_threshold))
     settings = NetworkConfig(encoding=cast(Any, encoding), timesteps=timesteps, event_threshold=threshold)
     # Whether the values suit the encoding was checked when the network was built.
-    encoder = Encoder(settings, int(facts["frame_stack"]), inputs_in_unit_range=True)
+    encoder = make_encoding(settings, int(facts["frame_stack"]), in_unit_range=True)
 
     def batches() -> Iterator[Float]:
         for seed, chunk in enumerate(chunks(observations)):
@@ -249,7 +253,7 @@ def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
             encoded: Float = encoder(scaled, torch.Generator().manual_seed(seed)).numpy()
             yield np.broadcast_to(encoded, (timesteps, *encoded.shape[1:]))
 
-    return _Inputs(len(observations), timesteps, encoding in SPIKE_ENCODINGS, encoding == "direct", batches())
+    return _Inputs(len(observations), timesteps, encoder.makes_spikes, encoder.constant_over_time, batches())
 
 
 def _encoded(inputs: Array, shape: tuple[int, ...], facts: dict[str, Any]) -> _Inputs:
@@ -261,9 +265,9 @@ def _encoded(inputs: Array, shape: tuple[int, ...], facts: dict[str, Any]) -> _I
             f"inputs has shape {_shape(inputs.shape)}, expected {expected} with T and N >= 1: the graph's Input at "
             "every simulation step"
         )
-    encoding = facts.get("encoding")
-    spikes = bool(((inputs == 0) | (inputs == 1)).all()) and encoding in (None, *SPIKE_ENCODINGS)
-    once = encoding == "direct" and bool((inputs == inputs[:1]).all())
+    encoding = ENCODINGS.get(str(facts.get("encoding")))  # None: of somebody else
+    spikes = bool(((inputs == 0) | (inputs == 1)).all()) and (encoding is None or encoding.makes_spikes)
+    once = encoding is not None and encoding.constant_over_time and bool((inputs == inputs[:1]).all())
     batches = (inputs[:, part].astype(np.float32) for part in chunks(np.arange(inputs.shape[1])))
     return _Inputs(inputs.shape[1], len(inputs), spikes, once, batches)
 

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import onnx
 from onnx import helper
 
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.formats.onnx_graph import FLOAT, Graph
+from switchmt_snn.spiking.encodings import Direct, Encoding, Events, Frames, Latency, encoding_class
 from switchmt_snn.spiking.folding import FoldedNetwork
+
+Rule = Callable[[Graph, FoldedNetwork, str], str]
+"""Adds an encoding's operators; takes the name of the scaled observation ``[B, *shape]``, returns that of the input."""
+
+RULES: dict[type[Encoding], Rule] = {}
+"""By encoding. A random encoding needs none: the host draws its inputs."""
+
+
+def encoding_rule(encoding: type[Encoding]) -> Callable[[Rule], Rule]:
+    """Function decorator: the ONNX operators of an encoding, also of one from outside the package."""
+
+    def register(rule: Rule) -> Rule:
+        RULES[encoding] = rule
+        return rule
+
+    return register
 
 
 def observation_input(network: FoldedNetwork) -> onnx.ValueInfoProto:
-    """Raw observations ``[B, *shape]``; under the random encoding, the spikes ``[T, B, *shape]`` that the host drew."""
-    if network.settings.encoding == "rate":
+    """Raw observations ``[B, *shape]``; under a random encoding, the inputs ``[T, B, *shape]`` that the host drew."""
+    if encoding_class(network.settings.encoding).is_random:
         shape: list[str | int | None] = [network.settings.timesteps, "batch", *network.encoded_shape]
         return helper.make_tensor_value_info("encoded", FLOAT, shape)
     dtype = helper.np_dtype_to_tensor_dtype(np.dtype(network.observation_dtype))
@@ -21,30 +40,31 @@ def observation_input(network: FoldedNetwork) -> onnx.ValueInfoProto:
 
 
 def encode(graph: Graph, network: FoldedNetwork) -> str:
-    """The encoded input: ``[B, ...]`` under direct encoding (the same at every step), else ``[T, B, ...]``.
+    """The encoded input: ``[B, ...]`` under an encoding that is constant over time, else ``[T, B, ...]``.
 
     Raises:
         ExportError: an encoding without a rule.
     """
-    encoding = network.settings.encoding
-    if encoding == "rate":
+    encoding = encoding_class(network.settings.encoding)
+    if encoding.is_random:
         return "encoded"
+    if encoding not in RULES:
+        raise ExportError(
+            f"ONNX has no rule for network.encoding {network.settings.encoding}, expected one of "
+            f"{', '.join(known.__name__ for known in RULES)}; add one with @encoding_rule({encoding.__name__}) of "
+            "switchmt_snn.export.formats.onnx_encodings"
+        )
     raw = graph.add("Cast", ["observation"], "observation_float", to=FLOAT)
     x = graph.add("Mul", [raw, graph.constant("scale", network.observation.scale)], "scaled")
-    if encoding == "direct":
-        return x
-    if encoding == "latency":
-        return _latency(graph, network, x)
-    if encoding == "frames":
-        return _frames(graph, network, x)
-    if encoding == "events":
-        return _events(graph, network, _frames(graph, network, x))
-    raise ExportError(
-        f"ONNX has no rule for network.encoding {encoding!r}, expected direct, rate, latency, frames or events; add "
-        "one to export/formats/onnx_encodings.py"
-    )
+    return RULES[encoding](graph, network, x)
 
 
+@encoding_rule(Direct)
+def _direct(graph: Graph, network: FoldedNetwork, x: str) -> str:
+    return x
+
+
+@encoding_rule(Latency)
 def _latency(graph: Graph, network: FoldedNetwork, x: str) -> str:
     T = network.settings.timesteps
     dark = graph.add("Sub", [graph.constant("one", 1.0), x], "darkness")
@@ -55,6 +75,7 @@ def _latency(graph: Graph, network: FoldedNetwork, x: str) -> str:
     return graph.add("Cast", [graph.add("And", [now, lit], "fires")], "encoded", to=FLOAT)
 
 
+@encoding_rule(Frames)
 def _frames(graph: Graph, network: FoldedNetwork, x: str) -> str:
     stack, (channels, *rest) = network.observation.frame_stack, network.observation.shape
     shape = [0, stack, channels // stack, *rest]
@@ -62,7 +83,9 @@ def _frames(graph: Graph, network: FoldedNetwork, x: str) -> str:
     return graph.add("Transpose", [unstacked], "frames", perm=[1, 0, *range(2, 3 + len(rest))])
 
 
-def _events(graph: Graph, network: FoldedNetwork, frames: str) -> str:
+@encoding_rule(Events)
+def _events(graph: Graph, network: FoldedNetwork, x: str) -> str:
+    frames = _frames(graph, network, x)
     start, end, axis = (graph.constant(n, [v], np.int64) for n, v in (("at_0", 0), ("at_last", -1), ("axis_0", 0)))
     older = graph.add("Slice", [frames, start, end, axis], "older")
     first = graph.add("Slice", [frames, start, graph.constant("at_1", [1], np.int64), axis], "first")

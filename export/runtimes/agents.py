@@ -21,7 +21,7 @@ from switchmt_snn.acting.evaluation import DecisionMaker
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
-from switchmt_snn.spiking.encodings import Encoder
+from switchmt_snn.spiking.encodings import make_encoding
 from switchmt_snn.spiking.layers import ReadoutNode
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -68,13 +68,22 @@ def _readable(source: Path | bytes, expected: str) -> Iterator[None]:
 
 
 def encode(suite: TaskSuite, config: ExperimentConfig, observations: Observations, seed_or_generator: Any) -> Float:
-    """Encoded inputs ``[T, B, ...]`` as the network sees them (random encodings draw from the generator)."""
+    """Encoded inputs ``[T, B, ...]`` as the network sees them (random encodings draw from the generator).
+
+    Raises:
+        ExportError: an encoding that is said to give spikes gave other values.
+    """
     generator = seed_or_generator
     if isinstance(generator, int):
         generator = torch.Generator().manual_seed(generator)
-    encoder = Encoder(config.network, suite.frame_stack, suite.in_unit_range)
+    encoder = make_encoding(config.network, suite.frame_stack, suite.in_unit_range)
     scaled = torch.from_numpy(np.ascontiguousarray(observations)).to(torch.float32) * suite.scale
     encoded: Float = encoder(scaled, generator).numpy()
+    if encoder.makes_spikes and not ((encoded == 0) | (encoded == 1)).all():
+        raise ExportError(
+            f"network.encoding {config.network.encoding} gave values other than 0 and 1, expected spikes as its "
+            "makes_spikes says; set makes_spikes = False"
+        )
     return np.broadcast_to(encoded, (config.network.timesteps, *encoded.shape[1:]))
 
 

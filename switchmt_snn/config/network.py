@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from switchmt_snn.config.checks import check_fields, require
 from switchmt_snn.config.methods import METHOD_TRAITS, Method
 from switchmt_snn.config.plugins import PluginName
+
+EncodingName = Literal["direct", "rate", "latency", "frames", "events"]
+ENCODING_NAMES: tuple[str, ...] = get_args(EncodingName)
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,9 @@ class NetworkConfig:
     """Units of each stream's hidden layer; null takes 512 for nature and 128 otherwise."""
     timesteps: int = 4
     """Simulation steps T per decision; ANN methods have none and resolve to 1."""
-    encoding: Literal["direct", "rate", "latency", "frames", "events"] | PluginName = "direct"
-    """How an observation becomes T inputs; see docs/algorithm.md, Encodings."""
+    encoding: EncodingName | PluginName = "direct"
+    """How an observation becomes T inputs: direct, rate, latency, frames, events (docs/algorithm.md, Encodings), or a
+    class from outside the package, package.module:Class (docs/extending.md)."""
     event_threshold: float = 0.02
     """encoding=events: an ON or OFF spike where the scaled pixel moved by more than this between frames."""
     readout: Literal["mean", "last_membrane", "max_membrane"] = "mean"

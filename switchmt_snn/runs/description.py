@@ -95,7 +95,7 @@ def describe_method(config: ExperimentConfig, suite: TaskSuite) -> MethodDescrip
 def _layers(network: QNetwork) -> list[LayerDescription]:
     """The network's nodes, each stream's hidden layer and head apart."""
     steps, nodes = network.config.timesteps, network_nodes(network)
-    first_steps = 1 if network.config.encoding == "direct" else steps
+    first_steps = 1 if network.encoder.constant_over_time else steps
     head_steps = 1 if network.config.readout == "mean" else steps
     layers = []
     for layer in nodes.trunk:

@@ -1,79 +1,272 @@
-"""Encodings: one observation -> the network's input at every simulation step.
+"""Encodings: how one observation becomes the network's input at every simulation step.
 
-Shapes: T simulation steps, B batch, F feature shape of the stacked observation (channels first), k frames per stack,
-c channels per frame.
+One class per encoding. The class states the facts that other parts of the package must know: whether it draws random
+numbers, whether it gives spikes, how many channels and simulation steps it needs.
+
+Shapes: T simulation steps, B batch, k frames per stack, c channels per frame, C channels of the input.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.config.network import ENCODING_NAMES
+from switchmt_snn.config.plugins import is_plugin, load_plugin
+from switchmt_snn.errors import ConfigError, did_you_mean
 
 
-class Encoder:
+class Encoding:
     """Turns scaled observations ``[B, k*c, ...]`` into inputs ``[T, B, C, ...]``.
 
-    - ``direct``: the observation itself at every step (returned as ``[1, B, ...]``: the caller computes the first
-      layer once and repeats its output).
-    - ``rate``: a spike with the probability of the pixel value, drawn anew at each step (Bernoulli, seeded generator).
-    - ``latency``: one spike per pixel, the brighter the earlier: at ``round((1 - x) * (T - 1))``; none where x = 0.
-    - ``frames``: the t-th stacked frame at step t; T must equal the stack.
-    - ``events``: ON and OFF spikes where a frame is brighter or darker than the one before it by more than
-      ``event_threshold`` (the first frame is compared with darkness); T must equal the stack, channels double.
+    A subclass defines ``makes_spikes`` and ``encode``, and the other facts where they differ from the defaults.
+
+    Attributes:
+        makes_spikes: whether every input is 0 or 1. Then a first layer accumulates weights, else it multiplies.
+        is_random: whether ``encode`` draws random numbers. Default: no.
+        constant_over_time: whether the input is the same at every step. It is then ``[1, B, C, ...]``, and the first
+            layer is computed once. Default: no.
+        needs_unit_range: whether observations must have values in [0, 1]. Default: no.
+        timesteps: T.
+        frame_stack: k.
     """
 
-    def __init__(self, config: NetworkConfig, frame_stack: int, inputs_in_unit_range: bool) -> None:
-        """Check that the encoding can express the observation.
+    makes_spikes: ClassVar[bool]
+    is_random: ClassVar[bool] = False
+    constant_over_time: ClassVar[bool] = False
+    needs_unit_range: ClassVar[bool] = False
 
-        Raises:
-            ConfigError: rate or latency over observations that are not in [0, 1].
-        """
-        if config.encoding in ("rate", "latency") and not inputs_in_unit_range:
-            raise ConfigError(
-                f"network.encoding is {config.encoding!r}, expected direct, frames or events for vector observations; "
-                "rate and latency need values in [0, 1]"
-            )
-        if config.encoding in ("frames", "events") and config.timesteps != frame_stack:
-            raise ConfigError(
-                f"network.timesteps is {config.timesteps!r}, expected tasks.frame_stack ({frame_stack}) for "
-                f"encoding={config.encoding}, one stacked frame per step"
-            )
-        self.encoding = config.encoding
+    def __init__(self, config: NetworkConfig, frame_stack: int) -> None:
+        """Take what it needs of the settings in section ``network``."""
         self.timesteps = config.timesteps
         self.frame_stack = frame_stack
-        self.event_threshold = config.event_threshold
 
-    @property
-    def is_random(self) -> bool:
-        """Whether encoding draws random numbers."""
-        return self.encoding == "rate"
-
-    def input_channels(self, observation_channels: int) -> int:
-        """Channels of the first layer for observations with this many stacked channels."""
-        if self.encoding == "frames":
-            return observation_channels // self.frame_stack
-        if self.encoding == "events":
-            return 2 * observation_channels // self.frame_stack
+    @classmethod
+    def channels(cls, observation_channels: int, frame_stack: int) -> int:
+        """Channels C of the input for observations with ``observation_channels`` (k*c) channels. Default: the same."""
         return observation_channels
 
+    @classmethod
+    def steps(cls, frame_stack: int) -> int | None:
+        """The number of simulation steps T that it needs for k frames per stack; None, the default, if any will do."""
+        return None
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Inputs ``[T, B, C, ...]`` (constant over time: ``[1, B, C, ...]``) of the dtype of ``x``.
+
+        Args:
+            x: scaled observations ``[B, k*c, ...]`` float.
+            generator: source of random numbers; None takes torch's own.
+        """
+        raise NotImplementedError(f"{type(self).__name__} defines no encode, expected its rule")
+
     def __call__(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Encode a scaled observation ``[B, k*c, ...]`` float; see the class for the shapes returned."""
-        if self.encoding == "direct":
-            return x.unsqueeze(0)
-        if self.encoding == "rate":
-            shape = (self.timesteps, *x.shape)
-            return (torch.rand(shape, generator=generator, device=x.device) < x).to(x.dtype)
-        if self.encoding == "latency":
-            when = torch.round((1.0 - x) * (self.timesteps - 1))
-            steps = torch.arange(self.timesteps, device=x.device).view(-1, *(1,) * x.dim())
-            return ((when == steps) & (x > 0)).to(x.dtype)
-        frames: Tensor = x.unflatten(1, (self.frame_stack, -1)).movedim(1, 0)  # [T, B, c, ...]
-        if self.encoding == "frames":
-            return frames
+        """As ``encode``.
+
+        Raises:
+            ConfigError: the result has another shape or dtype than the class states.
+        """
+        inputs = self.encode(x, generator)
+        steps = 1 if self.constant_over_time else self.timesteps
+        shape = (steps, x.shape[0], self.channels(x.shape[1], self.frame_stack), *x.shape[2:])
+        if inputs.shape != shape or inputs.dtype != x.dtype:
+            raise ConfigError(
+                f"encoding {type(self).__name__} gave {inputs.dtype} of shape {tuple(inputs.shape)}, expected "
+                f"{x.dtype} of shape {shape} (steps, batch, channels, ...); see its channels and constant_over_time"
+            )
+        return inputs
+
+
+ENCODINGS: dict[str, type[Encoding]] = {}
+"""The encodings of this package, by the name that ``network.encoding`` takes."""
+
+_E = TypeVar("_E", bound=type[Encoding])
+
+
+def register_encoding(name: str) -> Callable[[_E], _E]:
+    """Class decorator: makes an encoding of this package known by a name.
+
+    Raises:
+        ConfigError: the config does not take the name, the name is taken, or the class is no encoding.
+    """
+
+    def register(encoding: _E) -> _E:
+        if name not in ENCODING_NAMES:
+            raise ConfigError(
+                f"encoding {name!r} is not a value of network.encoding, expected one of {', '.join(ENCODING_NAMES)}; "
+                "add it to EncodingName in switchmt_snn/config/network.py, or use package.module:Class"
+            )
+        if ENCODINGS.get(name, encoding) is not encoding:
+            raise ConfigError(f"encoding {name!r} is {ENCODINGS[name].__name__}, expected a name that is free")
+        check_encoding(encoding, name)
+        ENCODINGS[name] = encoding
+        return encoding
+
+    return register
+
+
+def encoding_class(name: str) -> type[Encoding]:
+    """The class that ``network.encoding`` names: of this package, or ``package.module:Class``.
+
+    Raises:
+        ConfigError: the name is unknown, cannot be imported, or is no encoding.
+    """
+    if name in ENCODINGS:
+        return ENCODINGS[name]
+    if is_plugin(name):
+        return check_encoding(load_plugin(name, "network.encoding"), name)
+    raise ConfigError(
+        f"network.encoding is {name!r}, expected one of {', '.join(ENCODINGS)}, or package.module:Class"
+        f"{did_you_mean(name, ENCODINGS)}"
+    )
+
+
+def check_encoding(encoding: Any, name: str) -> type[Encoding]:
+    """Return the class if it is a whole encoding.
+
+    Raises:
+        ConfigError: it is no subclass of ``Encoding``, or lacks ``Encoding.makes_spikes`` or
+            ``Encoding.encode``.
+    """
+    seen = f"network.encoding is {name!r}"
+    if not (isinstance(encoding, type) and issubclass(encoding, Encoding)):
+        raise ConfigError(
+            f"{seen}, which is no encoding, expected a subclass of switchmt_snn.spiking.encodings.Encoding"
+        )
+    if encoding.encode is Encoding.encode:
+        raise ConfigError(f"{seen}, which defines no encode, expected encode(self, x, generator) -> Tensor")
+    for fact in ("makes_spikes", "is_random", "constant_over_time", "needs_unit_range"):
+        value = getattr(encoding, fact, None)
+        if not isinstance(value, bool):
+            raise ConfigError(f"{seen}, whose {fact} is {value!r}, expected True or False")
+    return encoding
+
+
+def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) -> Encoding:
+    """The encoding of a resolved config.
+
+    Args:
+        config: names it.
+        frame_stack: frames k per observation.
+        in_unit_range: whether scaled observations have values in [0, 1].
+
+    Raises:
+        ConfigError: an unknown encoding, or one that cannot express the observations in T steps.
+    """
+    cls = encoding_class(config.encoding)
+    if cls.needs_unit_range and not in_unit_range:
+        others = ", ".join(name for name, other in ENCODINGS.items() if not other.needs_unit_range)
+        raise ConfigError(
+            f"network.encoding is {config.encoding!r}, expected one of {others} for vector observations; "
+            f"{config.encoding} needs values in [0, 1]"
+        )
+    steps = cls.steps(frame_stack)
+    if steps is not None and config.timesteps != steps:
+        raise ConfigError(
+            f"network.timesteps is {config.timesteps!r}, expected {steps} for encoding {config.encoding} with "
+            f"tasks.frame_stack {frame_stack}"
+        )
+    return cls(config, frame_stack)
+
+
+@register_encoding("direct")
+class Direct(Encoding):
+    """The observation itself at every step; given once."""
+
+    makes_spikes = False
+    constant_over_time = True
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """``[1, B, k*c, ...]``."""
+        return x.unsqueeze(0)
+
+
+@register_encoding("rate")
+class Rate(Encoding):
+    """A spike with the probability of the pixel value, drawn anew at each step (Bernoulli)."""
+
+    makes_spikes = True
+    is_random = True
+    needs_unit_range = True
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Spikes ``[T, B, k*c, ...]``."""
+        shape = (self.timesteps, *x.shape)
+        return (torch.rand(shape, generator=generator, device=x.device) < x).to(x.dtype)
+
+
+@register_encoding("latency")
+class Latency(Encoding):
+    """One spike per pixel, the brighter the earlier: at ``round((1 - x) * (T - 1))``; none where x = 0."""
+
+    makes_spikes = True
+    needs_unit_range = True
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Spikes ``[T, B, k*c, ...]``."""
+        when = torch.round((1.0 - x) * (self.timesteps - 1))
+        steps = torch.arange(self.timesteps, device=x.device).view(-1, *(1,) * x.dim())
+        return ((when == steps) & (x > 0)).to(x.dtype)
+
+
+@register_encoding("frames")
+class Frames(Encoding):
+    """The t-th stacked frame at step t, so T = k."""
+
+    makes_spikes = False
+
+    @classmethod
+    def channels(cls, observation_channels: int, frame_stack: int) -> int:
+        """c, those of one frame."""
+        return observation_channels // frame_stack
+
+    @classmethod
+    def steps(cls, frame_stack: int) -> int | None:
+        """One step per frame."""
+        return frame_stack
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """``[T, B, c, ...]``."""
+        return frames_over_time(x, self.frame_stack)
+
+
+@register_encoding("events")
+class Events(Encoding):
+    """ON and OFF spikes where a frame is brighter or darker than the one before it by more than ``event_threshold``.
+
+    The first frame is compared with darkness. T = k; ON and OFF are channels of their own.
+    """
+
+    makes_spikes = True
+
+    def __init__(self, config: NetworkConfig, frame_stack: int) -> None:
+        super().__init__(config, frame_stack)
+        self.threshold = config.event_threshold
+
+    @classmethod
+    def channels(cls, observation_channels: int, frame_stack: int) -> int:
+        """2c: the ON channels of one frame, then its OFF channels."""
+        return 2 * observation_channels // frame_stack
+
+    @classmethod
+    def steps(cls, frame_stack: int) -> int | None:
+        """One step per frame."""
+        return frame_stack
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Spikes ``[T, B, 2c, ...]``."""
+        frames = frames_over_time(x, self.frame_stack)
         before = torch.cat([torch.zeros_like(frames[:1]), frames[:-1]])
         change = frames - before
-        on, off = change > self.event_threshold, change < -self.event_threshold
+        on, off = change > self.threshold, change < -self.threshold
         return torch.cat([on, off], dim=2).to(x.dtype)
+
+
+def frames_over_time(x: Tensor, frame_stack: int) -> Tensor:
+    """The frames of stacked observations ``[B, k*c, ...]`` as ``[k, B, c, ...]``."""
+    frames: Tensor = x.unflatten(1, (frame_stack, -1)).movedim(1, 0)
+    return frames

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ExportError, TaskError, did_you_mean
 from switchmt_snn.spiking.dendrites import ActiveDendrites
+from switchmt_snn.spiking.encodings import encoding_class
 from switchmt_snn.spiking.layers import (
     Array,
     Conv,
@@ -40,9 +41,6 @@ from switchmt_snn.spiking.layers import (
 from switchmt_snn.spiking.network import Convolution, ObservationSpec, QNetwork, Stream, TrunkLayer
 from switchmt_snn.spiking.neurons import NeuronLayer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
-
-SPIKE_ENCODINGS = ("rate", "latency", "events")
-"""Encodings whose values are spikes."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +100,12 @@ class FoldedNetwork:
     @property
     def sees_spikes(self) -> bool:
         """Whether the first layer's inputs are spikes."""
-        return self.settings.encoding in SPIKE_ENCODINGS
+        return encoding_class(self.settings.encoding).makes_spikes
 
     @property
     def constant_input(self) -> bool:
         """Whether the first layer has the same input at every simulation step, so that it is computed once."""
-        return self.settings.encoding == "direct"
+        return encoding_class(self.settings.encoding).constant_over_time
 
     @property
     def encoded_shape(self) -> tuple[int, ...]:
@@ -182,7 +180,7 @@ def network_nodes(network: QNetwork) -> NetworkNodes:
         ExportError: a module has no node.
     """
     tasks, shape = range(network.observation.num_tasks), network.observation.shape
-    shape = (network.encoder.input_channels(shape[0]), *shape[1:])
+    shape = (network.encoder.channels(shape[0], network.observation.frame_stack), *shape[1:])
     trunk: list[Layer] = []
     for name, layer in network.trunk.items():
         trunk.append(_trunk_layer(name, layer, shape, tasks))

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.dendrites import keep_k_winners, make_dendrites
-from switchmt_snn.spiking.encodings import Encoder
+from switchmt_snn.spiking.encodings import make_encoding
 from switchmt_snn.spiking.neurons import NeuronLayer, NeuronState, make_neuron_layer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 from switchmt_snn.spiking.readout import make_readout
@@ -155,7 +155,7 @@ class QNetwork(nn.Module):
         self.observation = observation
         self.spiking = traits.spiking
         self.readout = make_readout(config)
-        self.encoder = Encoder(config, observation.frame_stack, observation.in_unit_range)
+        self.encoder = make_encoding(config, observation.frame_stack, observation.in_unit_range)
         self.trunk = nn.ModuleDict()
         shape = self._build_trunk()
         features = math.prod(shape)
@@ -171,7 +171,7 @@ class QNetwork(nn.Module):
         config, observation = self.config, self.observation
         require_known("trunk", config.trunk, CONVOLUTIONS, "switchmt_snn.config.resolve replaces auto")
         require_known("normalization", config.normalization, ("per_task", "shared"))
-        channels = self.encoder.input_channels(observation.shape[0])
+        channels = self.encoder.channels(observation.shape[0], observation.frame_stack)
         shape: tuple[int, ...] = (channels, *observation.shape[1:])
         if config.trunk == "mlp":
             hidden = cast(int, config.hidden_units)

@@ -24,6 +24,7 @@ from switchmt_snn.export.parity.compare import Exports, compare, trace_torch
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations, exact_copy
 from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session, read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
+from switchmt_snn.spiking.encodings import ENCODINGS
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
 from switchmt_snn.spiking.neurons import NEURONS, LeakyLayer, NeuronLayer, NeuronState
 from tests.export.export_cases import VARIANTS, make_agent, observations
@@ -76,7 +77,7 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     reset=st.sampled_from(["zero", "subtract"]),
     timesteps=st.sampled_from([1, 2, 4, 8]),
     dendrites=st.sampled_from(["shared", "per_neuron"]),
-    encoding=st.sampled_from(["direct", "rate", "latency", "frames", "events"]),
+    encoding=st.sampled_from(sorted(ENCODINGS)),
     neuron=st.sampled_from(list(NEURONS)),
     readout=st.sampled_from(["mean", "last_membrane", "max_membrane"]),
     normalization=st.sampled_from(["per_task", "shared"]),
@@ -90,7 +91,7 @@ def test_any_network_is_exported_bitwise(
     network = {"method": method, "timesteps": timesteps, "normalization": normalization}
     if traits.spiking:
         network |= {"reset": reset, "encoding": encoding, "neuron": neuron, "readout": readout}
-        network["tasks"] = {"frame_stack": timesteps if encoding in ("frames", "events") else 2}
+        network["tasks"] = {"frame_stack": ENCODINGS[encoding].steps(timesteps) or 2}
     if traits.dendrites:
         network["dendrites"] = dendrites
     agent = make_agent(seed, **network)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from switchmt_snn.config import ExperimentConfig, NetworkConfig, resolve
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.spiking.encodings import ENCODINGS
 from switchmt_snn.spiking.network import (
     ObservationSpec,
     QNetwork,
@@ -100,7 +101,7 @@ def combine(outputs: dict[str, Tensor]) -> Tensor:
 
 
 @pytest.mark.parametrize("method", TABLE_3)
-@pytest.mark.parametrize("encoding", ["direct", "rate", "latency", "frames", "events"])
+@pytest.mark.parametrize("encoding", sorted(ENCODINGS))
 @pytest.mark.parametrize("readout", READOUTS)
 def test_folded_network_equals_plain_loop(method: str, encoding: str, readout: str) -> None:
     """In eval mode: weights are multiples of 1/64 and inputs of 1/4, so that folding may not even change rounding."""

@@ -1,4 +1,4 @@
-"""Encodings, dendrites, normalisation: small cases by hand, properties against PyTorch."""
+"""Dendrites, normalisation: small cases by hand, properties against PyTorch."""
 
 from __future__ import annotations
 
@@ -7,57 +7,8 @@ import torch
 from torch import nn
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.dendrites import ActiveDendrites, keep_k_winners
-from switchmt_snn.spiking.encodings import Encoder
 from switchmt_snn.spiking.normalization import TaskBatchNorm
-
-
-def encoder(encoding: str, timesteps: int, stack: int = 1) -> Encoder:
-    return Encoder(NetworkConfig(encoding=encoding, timesteps=timesteps), stack, inputs_in_unit_range=True)
-
-
-def test_direct_is_the_observation_once() -> None:
-    x = torch.rand(2, 3, 4, 4)
-    assert torch.equal(encoder("direct", 5)(x), x[None])
-
-
-def test_latency_fires_once_earlier_for_brighter() -> None:
-    x = torch.tensor([[1.0, 0.5, 0.1, 0.0]])
-    spikes = encoder("latency", 3)(x)[:, 0]
-    # (1 - x) * 2 = 0, 1, 1.8 -> steps 0, 1, 2; a black pixel never fires
-    assert spikes.tolist() == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-
-
-def test_rate_is_seeded_and_has_the_right_mean() -> None:
-    x = torch.tensor([[0.0, 0.25, 1.0]]).repeat(4000, 1)
-    one = encoder("rate", 4)(x, torch.Generator().manual_seed(3))
-    two = encoder("rate", 4)(x, torch.Generator().manual_seed(3))
-    assert torch.equal(one, two)
-    means = one.mean(dim=(0, 1))
-    assert means[0] == 0
-    assert means[2] == 1
-    assert abs(float(means[1]) - 0.25) < 0.015  # 16,000 draws: 4 standard errors are 0.0137
-
-
-def test_frames_gives_one_frame_per_step() -> None:
-    x = torch.arange(2 * 4 * 2).view(2, 4, 2).float()
-    out = encoder("frames", 4, stack=4)(x)
-    assert out.shape == (4, 2, 1, 2)
-    assert torch.equal(out[2, :, 0], x[:, 2])
-
-
-def test_events_are_on_and_off_changes() -> None:
-    frames = torch.tensor([0.5, 0.5, 0.9, 0.1]).view(1, 4, 1, 1)
-    out = encoder("events", 4, stack=4)(frames)
-    assert out.shape == (4, 1, 2, 1, 1)
-    assert out[:, 0, 0, 0, 0].tolist() == [1, 0, 1, 0]  # brighter: first frame against darkness, then 0.5 -> 0.9
-    assert out[:, 0, 1, 0, 0].tolist() == [0, 0, 0, 1]  # darker: 0.9 -> 0.1
-
-
-def test_vectors_cannot_be_rate_encoded() -> None:
-    with pytest.raises(ConfigError, match="rate and latency need values"):
-        Encoder(NetworkConfig(encoding="rate"), 1, inputs_in_unit_range=False)
 
 
 @pytest.mark.parametrize(("gating", "expected"), [("max", 0.5), ("absolute_max", -2.0)])

@@ -1,0 +1,165 @@
+"""Encodings: cases by hand, facts of every registered class, and classes from outside the package."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from switchmt_snn.config import NetworkConfig
+from switchmt_snn.config.network import ENCODING_NAMES
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.spiking.encodings import ENCODINGS, Encoding, make_encoding, register_encoding
+
+
+def encoder(encoding: str, timesteps: int, stack: int = 1) -> Encoding:
+    return make_encoding(NetworkConfig(encoding=encoding, timesteps=timesteps), stack, in_unit_range=True)
+
+
+def test_direct_is_the_observation_once() -> None:
+    x = torch.rand(2, 3, 4, 4)
+    assert torch.equal(encoder("direct", 5)(x), x[None])
+
+
+def test_latency_fires_once_earlier_for_brighter() -> None:
+    x = torch.tensor([[1.0, 0.5, 0.1, 0.0]])
+    spikes = encoder("latency", 3)(x)[:, 0]
+    # (1 - x) * 2 = 0, 1, 1.8 -> steps 0, 1, 2; a black pixel never fires
+    assert spikes.tolist() == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+
+
+def test_rate_is_seeded_and_has_the_right_mean() -> None:
+    x = torch.tensor([[0.0, 0.25, 1.0]]).repeat(4000, 1)
+    one = encoder("rate", 4)(x, torch.Generator().manual_seed(3))
+    two = encoder("rate", 4)(x, torch.Generator().manual_seed(3))
+    assert torch.equal(one, two)
+    means = one.mean(dim=(0, 1))
+    assert means[0] == 0
+    assert means[2] == 1
+    assert abs(float(means[1]) - 0.25) < 0.015  # 16,000 draws: 4 standard errors are 0.0137
+
+
+def test_frames_gives_one_frame_per_step() -> None:
+    x = torch.arange(2 * 4 * 2).view(2, 4, 2).float()
+    out = encoder("frames", 4, stack=4)(x)
+    assert out.shape == (4, 2, 1, 2)
+    assert torch.equal(out[2, :, 0], x[:, 2])
+
+
+def test_events_are_on_and_off_changes() -> None:
+    frames = torch.tensor([0.5, 0.5, 0.9, 0.1]).view(1, 4, 1, 1)
+    out = encoder("events", 4, stack=4)(frames)
+    assert out.shape == (4, 1, 2, 1, 1)
+    assert out[:, 0, 0, 0, 0].tolist() == [1, 0, 1, 0]  # brighter: first frame against darkness, then 0.5 -> 0.9
+    assert out[:, 0, 1, 0, 0].tolist() == [0, 0, 0, 1]  # darker: 0.9 -> 0.1
+
+
+def test_vectors_cannot_be_rate_encoded() -> None:
+    with pytest.raises(ConfigError, match=r"expected one of direct, frames, events .*; rate needs values in \[0, 1\]"):
+        make_encoding(NetworkConfig(encoding="rate"), 1, in_unit_range=False)
+
+
+def test_the_config_names_every_encoding_and_no_other() -> None:
+    assert set(ENCODINGS) == set(ENCODING_NAMES)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    name=st.sampled_from(sorted(ENCODINGS)),
+    stack=st.integers(1, 4),
+    steps=st.integers(1, 6),
+    channels=st.integers(1, 3),
+    seed=st.integers(0, 1000),
+)
+def test_every_encoding_has_its_facts(name: str, stack: int, steps: int, channels: int, seed: int) -> None:
+    cls = ENCODINGS[name]
+    timesteps = cls.steps(stack) or steps
+    encoding = make_encoding(NetworkConfig(encoding=name, timesteps=timesteps), stack, in_unit_range=True)
+    x = torch.rand(2, stack * channels, 3, generator=torch.Generator().manual_seed(seed))
+    one, again, other = (encoding(x, torch.Generator().manual_seed(n)) for n in (1, 1, 2))
+    assert one.shape == (1 if cls.constant_over_time else timesteps, 2, cls.channels(stack * channels, stack), 3)
+    assert torch.equal(one, again)
+    if not cls.is_random:
+        assert torch.equal(one, other)
+    if cls.makes_spikes:
+        assert ((one == 0) | (one == 1)).all()
+    each = torch.cat([encoding(x[b : b + 1]) for b in range(2)], dim=1)
+    assert cls.is_random or torch.equal(each, one), "an observation's input depends on the batch"
+
+
+def test_the_random_encoding_draws() -> None:
+    drawn = [encoder("rate", 4)(torch.full((1, 64), 0.5), torch.Generator().manual_seed(n)) for n in (1, 2)]
+    assert not torch.equal(*drawn)
+
+
+@pytest.mark.parametrize("name", ["frames", "events"])
+def test_an_encoding_by_frames_needs_one_step_per_frame(name: str) -> None:
+    complaint = f"network.timesteps is 3, expected 4 for encoding {name} with tasks.frame_stack 4"
+    with pytest.raises(ConfigError, match=complaint):
+        encoder(name, 3, stack=4)
+
+
+class Inverted(Encoding):
+    """1 - x at every step."""
+
+    makes_spikes = False
+    constant_over_time = True
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return (1 - x).unsqueeze(0)
+
+
+class NoFact(Encoding):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x.unsqueeze(0)
+
+
+class NoRule(Encoding):
+    makes_spikes = True
+
+
+class OtherShape(Inverted):
+    constant_over_time = False
+
+
+class OtherType(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return (x > 0).unsqueeze(0)
+
+
+class NoEncoding:
+    makes_spikes = True
+
+
+def test_an_encoding_from_outside_encodes() -> None:
+    x = torch.rand(2, 3)
+    assert torch.equal(encoder(f"{__name__}:Inverted", 5)(x), 1 - x[None])
+
+
+@pytest.mark.parametrize(
+    ("cls", "complaint"),
+    [
+        (NoEncoding, "is no encoding, expected a subclass of"),
+        (NoRule, "defines no encode, expected"),
+        (NoFact, "whose makes_spikes is None, expected True or False"),
+    ],
+)
+def test_a_class_that_is_no_whole_encoding_is_refused_in_one_line(cls: type, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        encoder(f"{__name__}:{cls.__name__}", 2)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("cls", [OtherShape, OtherType])
+def test_inputs_of_another_shape_or_type_than_stated_are_refused(cls: type) -> None:
+    with pytest.raises(ConfigError, match=rf"encoding {cls.__name__} gave torch\.\w+ of shape \(1, 2, 3\), expected"):
+        encoder(f"{__name__}:{cls.__name__}", 2)(torch.rand(2, 3))
+
+
+def test_a_registered_name_is_one_that_the_config_takes_and_that_is_free() -> None:
+    with pytest.raises(ConfigError, match="'inverted' is not a value"):
+        register_encoding("inverted")(Inverted)
+    with pytest.raises(ConfigError, match="'rate' is Rate, expected a name that is free"):
+        register_encoding("rate")(Inverted)
