@@ -53,7 +53,10 @@ def plain_loop(steps: int) -> Iterator[None]:
 
     def sample(held: int) -> Batch:
         chosen = rng.integers(0, held, BATCH)
-        return Batch(stacks[0, chosen], actions[chosen], rewards[chosen], stacks[1, chosen], terminals[chosen])
+        discounts = np.full(BATCH, 0.99, np.float32)
+        return Batch(
+            stacks[0, chosen], actions[chosen], rewards[chosen], stacks[1, chosen], terminals[chosen], discounts
+        )
 
     update = PeerUpdate(network, sample(1), False, "cpu", fused_adam=False)
     observation, _ = env.reset(seed=0)
@@ -65,7 +68,7 @@ def plain_loop(steps: int) -> Iterator[None]:
                 action = int(network(torch.from_numpy(np.asarray(observation)[None]).float() / 255).argmax())
         following, reward, terminated, truncated, _ = env.step(action)
         stacks[0, step], stacks[1, step] = observation, following
-        actions[step], rewards[step], terminals[step] = action, float(reward), terminated
+        actions[step], rewards[step], terminals[step] = action, float(np.clip(reward, -1.0, 1.0)), terminated
         observation = env.reset()[0] if terminated or truncated else following
         if step >= WARM_UP and step % UPDATE_EVERY == 0:
             update.batch = sample(step)

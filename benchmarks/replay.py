@@ -22,7 +22,7 @@ from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory
-from switchmt_snn.replay.ring import FrameReplay
+from switchmt_snn.replay.ring import FrameReplay, Returns
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.play import Play, episode_seed
@@ -123,7 +123,7 @@ def measure(run: str | None, steps: int, repeats: int) -> dict[str, Any]:
             }
             if compressed:
                 for batch_size, count in ((32, repeats), (512, 2)):
-                    batch = replay.sample(batch_size, rng)
+                    batch = replay.sample(batch_size, rng, Returns())
                     game[f"update_{batch_size}"] = times_ms(partial(learner.update, batch, task), count)
         for kind, twice in (("stacks, both", True), ("stacks, one", False)):
             stacked = StackReplay(STACKED_STEPS, suite.observation_shape, twice)

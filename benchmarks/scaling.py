@@ -42,7 +42,8 @@ def learner_of(timesteps: int, batch_size: int, tasks: int) -> tuple[Learner, Ba
     frames = rng.integers(0, 256, (2, batch_size, 4, 84, 84), np.uint8)
     rewards = rng.normal(size=batch_size).astype(np.float32)
     actions = rng.integers(0, ACTIONS, batch_size)
-    return learner, Batch(frames[0], actions, rewards, frames[1], np.zeros(batch_size, np.bool_))
+    terminated, discounts = np.zeros(batch_size, np.bool_), np.full(batch_size, 0.99, np.float32)
+    return learner, Batch(frames[0], actions, rewards, frames[1], terminated, discounts)
 
 
 def updates(repeats: int) -> dict[str, Any]:

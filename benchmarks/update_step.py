@@ -71,13 +71,13 @@ class PeerUpdate:
     def __call__(self) -> None:
         """One update."""
         tensors = (torch.as_tensor(getattr(self.batch, field.name)).to(self.device) for field in fields(Batch))
-        x, actions, rewards, x_next, terminated = tensors
+        x, actions, rewards, x_next, terminated, discounts = tensors
         x, x_next = x.float() / 255, x_next.float() / 255
         with torch.no_grad():
             self.network.eval()
             chosen = self.q(self.network, x_next).argmax(1, keepdim=True)
             value = self.q(self.target, x_next).gather(1, chosen).squeeze(1)
-            goal = rewards + 0.99 * value * ~terminated
+            goal = rewards + discounts * value * ~terminated
         self.network.train()
         loss = F.mse_loss(self.q(self.network, x).gather(1, actions[:, None]).squeeze(1), goal)
         self.optimizer.zero_grad(set_to_none=True)
@@ -122,7 +122,8 @@ def variants(batch_size: int, timesteps: int, device: str) -> tuple[dict[str, Ca
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (2, batch_size, *suite.observation_shape), np.uint8)
     rewards = rng.normal(size=batch_size).astype(np.float32)
-    batch = Batch(frames[0], rng.integers(0, ACTIONS, batch_size), rewards, frames[1], np.zeros(batch_size, np.bool_))
+    terminated, discounts = np.zeros(batch_size, np.bool_), np.full(batch_size, 0.99, np.float32)
+    batch = Batch(frames[0], rng.integers(0, ACTIONS, batch_size), rewards, frames[1], terminated, discounts)
     if device == "cuda":  # as with learning.replay_on_device
         x, x_next = torch.from_numpy(frames).to(device)
         batch = replace(batch, observations=x, next_observations=x_next)

@@ -60,7 +60,8 @@ for name in ("eager", "auto"):
     rng = np.random.default_rng(0)
     for step in range(3):
         x = (rng.random((2, 8, 4, 10, 10)) < 0.4).astype(np.uint8)
-        learner.update(Batch(x[0], rng.integers(0, 6, 8), np.ones(8, np.float32), x[1], np.zeros(8, np.bool_)), step)
+        ones = np.ones(8, np.float32)
+        learner.update(Batch(x[0], rng.integers(0, 6, 8), ones, x[1], np.zeros(8, np.bool_), ones), step)
     losses[name] = learner.take_means()["loss"]
 assert losses["eager"] == losses["auto"] > 0, losses
 assert ENGINES["native"].status() == "the package switchmt_snn.native is not installed"

@@ -22,6 +22,8 @@ class LearningConfig:
     """Adam's epsilon."""
     discount: float = 0.99
     """Discount factor gamma."""
+    n_steps: int = 1
+    """Rewards that a target adds up before the bootstrapped value (1: Eq. 2). A sum ends early with its episode."""
     double_q: bool = True
     """Choose the next action with the online network and value it with the target network (Eq. 2)."""
     loss: Literal["mse", "huber"] = "mse"
@@ -38,7 +40,7 @@ class LearningConfig:
     torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for Atari-size
     networks if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or more; else eager."""
     clip_rewards: bool = True
-    """Clip rewards to [-1, 1] in the learner; logs and scores always hold the raw reward."""
+    """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576
     """Transitions kept per task."""
     replay_compression: Literal["auto", "zstd", "none"] = "auto"
@@ -77,7 +79,13 @@ class LearningConfig:
         if self.replay_on_device:
             require(self.replay_compression != "zstd", "learning.replay_compression", "zstd", "none on a device")
         require(self.replay_max_gib > 0, "learning.replay_max_gib", self.replay_max_gib, "above 0")
-        for name in ("replay_capacity_steps", "update_every_steps", "target_update_every_steps", "epsilon_decay_steps"):
+        for name in (
+            "n_steps",
+            "replay_capacity_steps",
+            "update_every_steps",
+            "target_update_every_steps",
+            "epsilon_decay_steps",
+        ):
             value = getattr(self, name)
             require(value >= 1, f"learning.{name}", value, "at least 1")
         require(

@@ -27,20 +27,23 @@ from switchmt_snn.updates.protocol import DeviceBatch, EngineFactory
 
 
 def td_target(
-    rewards_B: Tensor, terminated_B: Tensor, q_next_BA: Tensor, q_choice_BA: Tensor, discount: float
+    rewards_B: Tensor, terminated_B: Tensor, q_next_BA: Tensor, q_choice_BA: Tensor, discounts_B: Tensor
 ) -> Tensor:
     """Eq. 2: ``y_n = r_n`` if the next state is terminal, else ``r_n + gamma Q*(s', argmax_a Q(s', a))``.
+
+    For transitions of n steps, ``r_n`` is the discounted sum of their rewards, ``s'`` the state after them, and
+    ``gamma^n`` stands for gamma.
 
     Args:
         rewards_B: rewards r_n.
         terminated_B: whether the next state is terminal. A truncated episode's next state is not.
         q_next_BA: target network's values Q* of the next states.
         q_choice_BA: values that choose the action; -inf where an action does not exist.
-        discount: gamma.
+        discounts_B: gamma, or gamma^n.
     """
     action_B1 = q_choice_BA.argmax(dim=1, keepdim=True)
     value_B = q_next_BA.gather(1, action_B1).squeeze(1)
-    return rewards_B + discount * value_B.masked_fill(terminated_B, 0.0)
+    return rewards_B + discounts_B * value_B.masked_fill(terminated_B, 0.0)
 
 
 LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"mse": F.mse_loss, "huber": F.huber_loss}
@@ -134,26 +137,30 @@ class Learner(Stateful):
 
     def update(self, batch: Batch, task: int) -> None:
         """One gradient step on a batch of one task."""
-        parts = (batch.observations, batch.actions, batch.rewards, batch.next_observations, batch.terminated)
-        self._step(DeviceBatch(*(self._tensor(part) for part in parts)), task)
+        parts = DeviceBatch(
+            observations=self._tensor(batch.observations),
+            actions_B=self._tensor(batch.actions),
+            rewards_B=self._tensor(batch.rewards),
+            next_observations=self._tensor(batch.next_observations),
+            terminated_B=self._tensor(batch.terminated),
+            discounts_B=self._tensor(batch.discounts),
+        )
+        self._step(parts, task)
         self.updates += 1
         self.summed += 1
 
     def _device_step(self, batch: DeviceBatch, task: int) -> None:
         """All of an update that happens on the device; nothing here may read a number back to the host."""
-        config, rewards_B = self.config, batch.rewards_B
-        if config.clip_rewards:
-            rewards_B = rewards_B.clamp(-1.0, 1.0)
         values = self.engine.values(batch.observations, batch.next_observations, task, self.generator)
         with torch.no_grad():
             q_choice_BA = values.choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
-            target_B = td_target(rewards_B, batch.terminated_B, values.next_BA, q_choice_BA, config.discount)
+            target_B = td_target(batch.rewards_B, batch.terminated_B, values.next_BA, q_choice_BA, batch.discounts_B)
         q_B = values.q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
         loss = self._loss(q_B, target_B)
         for parameter in self._trained:
             parameter.grad = None
         loss.backward()
-        self._clip(self._trained, config.gradient_clip_at)
+        self._clip(self._trained, self.config.gradient_clip_at)
         self.optimizer.step()
         with torch.no_grad():
             self.loss_sum += self.engine.over_processes(loss.detach())

@@ -24,7 +24,7 @@ from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
 from switchmt_snn.machine.memory import GIB
-from switchmt_snn.replay.ring import FrameReplay
+from switchmt_snn.replay.ring import FrameReplay, Returns
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.tasks.play import Play, episode_seed
@@ -171,11 +171,13 @@ class Training(Stateful):
     def _learn(self) -> None:
         """The updates that are due, from the current task's buffer or from every task's in turn."""
         learning = self.config.learning
+        returns = Returns(learning.n_steps, learning.discount, learning.clip_rewards)
         for _ in range(self.update_clock.advance(self.num_envs)):
             tasks = [self.task] if learning.update_tasks == "current" else range(len(self.replays))
             for task in tasks:
                 if not self.is_warming_up(task):
-                    self.learner.update(self.replays[task].sample(learning.batch_size, self.sample_rng), task)
+                    batch = self.replays[task].sample(learning.batch_size, self.sample_rng, returns)
+                    self.learner.update(batch, task)
 
     def _end_episodes(self, play: Play, played: VectorStep, epsilon: float) -> Iterator[Event]:
         """Report ended episodes, ask the policy, and start what comes next (Algorithm 1, lines 13-20)."""

@@ -32,15 +32,42 @@ SEGMENT_SLOTS = 1024
 
 
 @dataclass(frozen=True)
+class Returns:
+    """How the rewards that follow an action become one number: ``sum_i discount^i r_(t+i)`` over up to n steps.
+
+    The sum stops early after a terminal step, at the end of a truncated episode, and at the newest step of the lane.
+    Its target then bootstraps (unless terminal) from the observation at which it stopped.
+
+    Attributes:
+        n_steps: longest sum (1: the plain transition).
+        discount: gamma.
+        clip_rewards: clip every reward to [-1, 1] before it is added.
+    """
+
+    n_steps: int = 1
+    discount: float = 0.99
+    clip_rewards: bool = False
+
+
+@dataclass(frozen=True)
 class Batch:
-    """Sampled transitions of one task; observations are stacked ``[B, k*c, ...]`` (tensors where frames lie on the
-    learner's device), rewards raw."""
+    """Sampled transitions of one task, of up to n steps each.
+
+    Observations are stacked ``[B, k*c, ...]`` (tensors if frames are stored on the learner's device).
+
+    Attributes:
+        rewards: discounted sum of the rewards of the transition's steps; raw unless ``Returns`` clips them.
+        next_observations: the observation after these steps.
+        terminated: whether the last of them was terminal.
+        discounts: what the value of the next observation is multiplied by: ``discount^steps``.
+    """
 
     observations: npt.NDArray[Any] | Tensor
     actions: npt.NDArray[np.int64]
     rewards: npt.NDArray[np.float32]
     next_observations: npt.NDArray[Any] | Tensor
     terminated: npt.NDArray[np.bool_]
+    discounts: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -176,7 +203,7 @@ class FrameReplay:
                 self._valid[later] = False
         self._oldest[lane] = max(int(self._oldest[lane]), oldest)
 
-    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+    def sample(self, batch_size: int, rng: np.random.Generator, returns: Returns) -> Batch:
         """Draw transitions uniformly, with replacement.
 
         Raises:
@@ -190,24 +217,52 @@ class FrameReplay:
             draw = rng.integers(0, self.num_lanes * filled, size=batch_size - len(chosen))
             slots = draw // filled * self.slots + draw % filled
             chosen = np.concatenate([chosen, slots[self._valid[slots]]])
-        return self.gather(chosen)
+        return self.gather(chosen, returns)
 
-    def gather(self, slots: npt.NDArray[np.int64]) -> Batch:
+    def gather(self, slots: npt.NDArray[np.int64], returns: Returns) -> Batch:
         """The transitions that start in these (flat) slots."""
-        k = self.stack
+        k, n = self.stack, returns.n_steps
+        rewards_B, terminated_B, steps_B = self._add_up(slots, returns)
         lanes_B1, within_B1 = slots[:, None] // self.slots, slots[:, None] % self.slots
-        back = np.arange(k - 1, -2, -1)[None, :]  # k-1 ... 0 for the observation, -1 for the next frame
-        sources = lanes_B1 * self.slots + (within_B1 - back) % self.slots
-        before_start = back > self._age[slots][:, None]
-        frames = self._frames.read(np.where(before_start, -1, sources))  # [B, k+1, c, ...]
+        offsets = np.arange(1 - k, n + 1)[None, :]  # 1-k ... 0 for the observation, then the frames that follow
+        sources = lanes_B1 * self.slots + (within_B1 + offsets) % self.slots
+        outside = (-offsets > self._age[slots][:, None]) | (offsets > steps_B[:, None])
+        frames = self._frames.read(np.where(outside, -1, sources))  # [B, k+n, c, ...]
+        if n == 1:
+            next_frames = frames[:, 1:]
+        else:
+            last_k_Bk = steps_B[:, None] + np.arange(k)[None, :]
+            next_frames = frames[np.arange(len(slots))[:, None], last_k_Bk]
         shape = (len(slots), k * frames.shape[2], *frames.shape[3:])
         return Batch(
             observations=frames[:, :k].reshape(shape),
             actions=self._actions[slots].astype(np.int64),
-            rewards=self._rewards[slots],
-            next_observations=frames[:, 1:].reshape(shape),
-            terminated=self._terminated[slots],
+            rewards=rewards_B,
+            next_observations=next_frames.reshape(shape),
+            terminated=terminated_B,
+            discounts=(returns.discount**steps_B).astype(np.float32),
         )
+
+    def _add_up(
+        self, slots: npt.NDArray[np.int64], returns: Returns
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+        """For each start slot ``[B]``: discounted sum of rewards, whether its last step was terminal, its length."""
+        total_B = np.zeros(len(slots), np.float32)
+        terminated_B = np.zeros(len(slots), np.bool_)
+        steps_B = np.zeros(len(slots), np.int64)
+        lanes_B, within_B = slots // self.slots, slots % self.slots
+        running_B = np.ones(len(slots), np.bool_)
+        for step in range(returns.n_steps):
+            now_B = lanes_B * self.slots + (within_B + step) % self.slots
+            running_B &= self._actions[now_B] >= 0  # the last frame of an episode, and the newest one, have no action
+            reward_B = self._rewards[now_B]
+            if returns.clip_rewards:
+                reward_B = reward_B.clip(-1.0, 1.0)
+            total_B += np.where(running_B, np.float32(returns.discount**step) * reward_B, np.float32(0.0))
+            steps_B += running_B
+            terminated_B |= running_B & self._terminated[now_B]
+            running_B &= ~self._terminated[now_B]
+        return total_B, terminated_B, steps_B
 
     def valid_slots(self) -> npt.NDArray[np.int64]:
         """All slots that can be sampled, for tests and for going through the memory in order."""

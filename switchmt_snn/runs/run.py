@@ -165,7 +165,8 @@ def _serve(group: ProcessGroup) -> RunResult:
     size = config.learning.batch_size // group.size
     observations = np.zeros((size, *suite.observation_shape), suite.frame_dtype)
     numbers = np.zeros(size, np.int64)
-    learner.serve(Batch(observations, numbers, numbers.astype(np.float32), observations, numbers.astype(np.bool_)))
+    rewards = numbers.astype(np.float32)
+    learner.serve(Batch(observations, numbers, rewards, observations, numbers.astype(np.bool_), rewards))
     return RunResult(Path(), "served", learner.updates, None)
 
 

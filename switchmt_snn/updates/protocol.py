@@ -38,8 +38,11 @@ class DeviceBatch(NamedTuple):
     """``[B, *shape]``, raw."""
     actions_B: Tensor
     rewards_B: Tensor
+    """Discounted sums over the transition's steps."""
     next_observations: Tensor
     terminated_B: Tensor
+    discounts_B: Tensor
+    """gamma^n of a transition of n steps."""
 
 
 Step = Callable[[DeviceBatch, int], None]

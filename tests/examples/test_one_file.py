@@ -80,7 +80,8 @@ def test_td_target_equals_the_one_file_target() -> None:
     terminal = torch.rand(100, generator=generator) < 0.3
     q_star, q = torch.randn(2, 100, 5, generator=generator)
     assert torch.equal(
-        td_target(rewards, terminal, q_star, q, 0.9), one_file.td_target(rewards, terminal, q_star, q, 0.9)
+        td_target(rewards, terminal, q_star, q, torch.full_like(rewards, 0.9)),
+        one_file.td_target(rewards, terminal, q_star, q, 0.9),
     )
 
 
@@ -93,7 +94,7 @@ def test_gradients_of_an_update_equal_the_one_file_gradients() -> None:
     actions, terminal = rng.integers(0, ACTIONS, 40), rng.random(40) < 0.3
     rewards = rng.choice([-1.0, 0.0, 1.0], 40).astype(np.float32)
     before, after = images(1).numpy(), images(2).numpy()
-    learner.update(Batch(before, actions, rewards, after, terminal), 1)
+    learner.update(Batch(before, actions, rewards, after, terminal, np.full(40, 0.9, np.float32)), 1)
     parts = (before, actions, rewards, after, terminal)
     one_file.loss_on(tuple(torch.from_numpy(part) for part in parts), theirs, target, 1, discount=0.9).backward()
     gradients = {name: parameter.grad for name, parameter in theirs.named_parameters()}

@@ -14,6 +14,7 @@ from switchmt_snn.config import resolve
 from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.training import Training
+from switchmt_snn.replay.ring import Returns
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.registry import make_suite
 
@@ -70,7 +71,7 @@ def test_the_other_thread_changes_nothing_at_any_step(monkeypatch: pytest.Monkey
         steps += 1
     assert steps > 400
     assert trainings[0].learner.updates > 300
-    replays = [[replay.gather(replay.valid_slots()) for replay in each.replays] for each in trainings]
+    replays = [[replay.gather(replay.valid_slots(), Returns()) for replay in each.replays] for each in trainings]
     for one, other in zip(replays[0], replays[1], strict=True):
         assert np.array_equal(one.observations, other.observations)
         assert np.array_equal(one.actions, other.actions)

@@ -28,6 +28,7 @@ from switchmt_snn.learning.switching import (
 )
 from switchmt_snn.learning.switching.parameter_change import relative_change
 from switchmt_snn.learning.switching.reward_plateau import slope_test
+from switchmt_snn.replay.ring import Returns
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite
 
 
@@ -133,7 +134,7 @@ def test_snapshots_are_copies() -> None:
         del event
     before = learner.parameters()
     kept = before.clone()
-    learner.update(training.replays[0].sample(8, np.random.default_rng(0)), 0)
+    learner.update(training.replays[0].sample(8, np.random.default_rng(0), Returns()), 0)
     assert torch.equal(before, kept), "the snapshot moved with the network"
     assert relative_change(before, learner.parameters()) > 0
 

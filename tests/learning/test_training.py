@@ -41,7 +41,8 @@ def run(training: Training) -> list[Any]:
 def test_batches_never_mix_tasks_or_cross_episodes(num_envs: int, update_tasks: str, monkeypatch) -> None:
     """The agent sees contiguous steps of its task; every sampled transition is two neighbours of one episode."""
     config = small_config(
-        tasks={"num_envs": num_envs}, learning={"update_tasks": update_tasks, "update_every_steps": 2}
+        tasks={"num_envs": num_envs},
+        learning={"update_tasks": update_tasks, "update_every_steps": 2, "clip_rewards": False},
     )
     training = counting(config)
     checked = {"batches": 0, "actions": 0, "padded": 0}
@@ -269,12 +270,14 @@ def golden_run() -> dict[str, Any]:
     )
     network = build_network(config.network, ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), 11)
     learner = Learner(network, config.learning, np.ones((3, 6), np.bool_), torch.device("cpu"), 0)
-    rng = np.random.default_rng(5)
+    rng, discounts = np.random.default_rng(5), np.full(16, 0.99, np.float32)
     losses, spikes = [], {}
     for update in range(200):
         task = update // 20 % 3
         x = (rng.random((2, 16, 4, 10, 10)) < 0.2 + 0.1 * task).astype(np.uint8)
-        batch = Batch(x[0], rng.integers(0, 6, 16), x[0, :, 0, 0, 0].astype(np.float32), x[1], rng.random(16) < 0.1)
+        batch = Batch(
+            x[0], rng.integers(0, 6, 16), x[0, :, 0, 0, 0].astype(np.float32), x[1], rng.random(16) < 0.1, discounts
+        )
         learner.update(batch, task)
         losses.append(learner.take_means()["loss"])
         if update % 50 == 49:

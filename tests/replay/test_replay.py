@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from switchmt_snn.replay.frames import CompressedFrames, PlainFrames
-from switchmt_snn.replay.ring import BLOCK_SLOTS, SEGMENT_SLOTS, FrameReplay, Segment
+from switchmt_snn.replay.ring import BLOCK_SLOTS, SEGMENT_SLOTS, FrameReplay, Returns, Segment
 
 
 @dataclass
@@ -24,9 +24,11 @@ class NaiveLane:
     shape: tuple[int, ...]
     episode: list[npt.NDArray[np.uint8]] = field(default_factory=list)
     transitions: list[dict] = field(default_factory=list)
+    starts: list[int] = field(default_factory=list)
     written: int = 0
 
     def begin(self, frame: npt.NDArray[np.uint8]) -> None:
+        self.starts.append(len(self.transitions))
         self.episode = [frame]
         self.written += 1
 
@@ -48,6 +50,7 @@ class NaiveLane:
                 "terminated": terminated,
                 "next": self.stacked(self.episode),
                 "oldest": oldest,
+                "episode": len(self.starts),
             }
         )
 
@@ -59,7 +62,20 @@ class NaiveLane:
         oldest = max(0, start - self.slots + min(block, self.slots - start % self.slots))
         return [t for t in self.transitions if t["oldest"] >= oldest]
 
+    def following(self, first: dict, n_steps: int) -> list[dict]:
+        """The transition and those after it in its episode, up to a terminal one."""
+        at = next(i for i, one in enumerate(self.transitions) if one is first)
+        chain: list[dict] = []
+        for one in self.transitions[at : at + n_steps]:
+            if one["episode"] != first["episode"]:
+                break
+            chain.append(one)
+            if one["terminated"]:
+                break
+        return chain
 
+
+ONE_STEP = Returns()
 FORMS = ("plain", "compressed", "device")
 
 
@@ -93,7 +109,7 @@ def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator,
 
 def compare(replay: FrameReplay, lanes: list[NaiveLane]) -> None:
     replay.check_valid()
-    batch = replay.gather(replay.valid_slots())
+    batch = replay.gather(replay.valid_slots(), ONE_STEP)
     observations, following = np.asarray(batch.observations), np.asarray(batch.next_observations)
     ours = {
         (o.tobytes(), int(a), float(r), bool(t), n.tobytes())
@@ -125,6 +141,75 @@ def test_equals_naive_list(num_lanes: int, slots: int, stack: int, operations: i
     compare(replay, lanes)
 
 
+def test_two_steps_by_hand() -> None:
+    """Rewards 1, 10, 100 and a terminal end: sums of two steps with discount 0.5 are 1 + 5, 10 + 50, 100."""
+    replay = FrameReplay(20, 1, (1,), np.float32, 1)
+    frames = [np.full(1, value, np.float32) for value in range(4)]
+    replay.begin(0, frames[0])
+    for step, reward in enumerate((1.0, 10.0, 100.0)):
+        replay.add(0, step, reward, step == 2, frames[step + 1])
+    batch = replay.gather(replay.valid_slots(), Returns(n_steps=2, discount=0.5))
+    assert batch.rewards.tolist() == [6.0, 60.0, 100.0]
+    assert batch.terminated.tolist() == [False, True, True]
+    assert np.ravel(batch.next_observations).tolist() == [2.0, 3.0, 3.0]
+    assert batch.discounts.tolist() == [0.25, 0.25, 0.5]
+    clipped = replay.gather(replay.valid_slots(), Returns(n_steps=2, discount=0.5, clip_rewards=True))
+    assert clipped.rewards.tolist() == [1.5, 1.5, 1.0]
+
+
+def test_a_truncated_episode_and_the_newest_step_end_a_sum_and_still_bootstrap() -> None:
+    replay = FrameReplay(20, 1, (1,), np.float32, 1)
+    for episode in range(2):
+        replay.begin(0, np.full(1, 10.0 * episode, np.float32))
+        for step in range(2):
+            replay.add(0, step, 1.0, False, np.full(1, 10.0 * episode + step + 1, np.float32))
+    batch = replay.gather(replay.valid_slots(), Returns(n_steps=3, discount=0.5))
+    assert batch.rewards.tolist() == [1.5, 1.0, 1.5, 1.0]
+    assert np.ravel(batch.next_observations).tolist() == [2.0, 2.0, 12.0, 12.0]
+    assert batch.discounts.tolist() == [0.25, 0.5, 0.25, 0.5]
+    assert not batch.terminated.any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    num_lanes=st.integers(1, 3),
+    slots=st.integers(6, 40) | st.integers(8 * BLOCK_SLOTS, 300),
+    stack=st.integers(1, 4),
+    operations=st.integers(0, 700),
+    n_steps=st.integers(1, 6),
+    clip=st.booleans(),
+    seed=st.integers(0, 2**31),
+    form=st.sampled_from(FORMS),
+)
+def test_sums_of_n_steps_equal_the_naive_list(
+    num_lanes: int, slots: int, stack: int, operations: int, n_steps: int, clip: bool, seed: int, form: str
+) -> None:
+    """They stop at terminal steps, truncated episodes, lane borders and the newest step, also in a wrapped ring."""
+    shape, discount = (2, 3), 0.9
+    replay = ring(form, slots * num_lanes, num_lanes, shape, stack)
+    lanes = [NaiveLane(slots, stack, shape) for _ in range(num_lanes)]
+    drive(replay, lanes, np.random.default_rng(seed), operations)
+    batch = replay.gather(replay.valid_slots(), Returns(n_steps, discount, clip))
+    ours = {
+        (np.asarray(o).tobytes(), int(a)): (float(r), bool(t), np.asarray(n).tobytes(), float(d))
+        for o, a, r, n, t, d in zip(*vars(batch).values(), strict=True)
+    }
+    expected = {}
+    for lane in lanes:
+        for first in lane.held():
+            chain = lane.following(first, n_steps)
+            rewards = [np.clip(one["reward"], -1, 1) if clip else one["reward"] for one in chain]
+            total = sum(discount**i * reward for i, reward in enumerate(rewards))
+            last = chain[-1]
+            outcome = (total, last["terminated"], last["next"].tobytes(), discount ** len(chain))
+            expected[first["observation"].tobytes(), first["action"]] = outcome
+    assert ours.keys() == expected.keys()
+    for key, (total, *rest, factor) in expected.items():
+        assert ours[key][0] == pytest.approx(total, rel=1e-5, abs=1e-6)
+        assert list(ours[key][1:3]) == rest
+        assert ours[key][3] == pytest.approx(factor)
+
+
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("slots", [700, SEGMENT_SLOTS, 2500])
 def test_stored_and_loaded_is_the_same(slots: int, form: str) -> None:
@@ -144,7 +229,7 @@ def test_stored_and_loaded_is_the_same(slots: int, form: str) -> None:
     for segment in replay.segments():
         copy.load_segment(segment, stored[segment])
     compare(copy, lanes)
-    one, two = (r.sample(64, np.random.default_rng(3)) for r in (replay, copy))
+    one, two = (r.sample(64, np.random.default_rng(3), ONE_STEP) for r in (replay, copy))
     assert np.array_equal(one.observations, two.observations)
     assert np.array_equal(one.next_observations, two.next_observations)
     assert copy.nbytes == replay.nbytes
@@ -168,8 +253,8 @@ def test_other_forms_equal_plain(dtype: type, shape: tuple[int, ...], form: str)
             if end:
                 replay.begin(lane, frames[1])
             if step in (5, 100, 1199):
-                ours = replay.sample(50, np.random.default_rng(step))
-                theirs = plain.sample(50, np.random.default_rng(step)) if step == 1199 else ours
+                ours = replay.sample(50, np.random.default_rng(step), ONE_STEP)
+                theirs = plain.sample(50, np.random.default_rng(step), ONE_STEP) if step == 1199 else ours
                 for one, two in zip(vars(ours).values(), vars(theirs).values(), strict=True):
                     assert np.array_equal(one, two)
                     assert np.asarray(one).dtype == np.asarray(two).dtype
@@ -199,7 +284,7 @@ def test_noise_stays_below_the_cap_and_what_is_left_is_right() -> None:
     assert largest <= cap
     assert 100 < len(replay) < 300, "60 kB of 256-byte frames"
     replay.check_valid()
-    batch = replay.gather(replay.valid_slots())
+    batch = replay.gather(replay.valid_slots(), ONE_STEP)
     for next_observation, reward in zip(batch.next_observations, batch.rewards, strict=True):
         assert any(np.array_equal(next_observation[-1:], of_lane.get(float(reward))) for of_lane in frames)
 
@@ -216,8 +301,8 @@ def test_sampling_is_uniform_and_seeded() -> None:
     rng = np.random.default_rng(0)
     counts = np.zeros(40)
     original = replay.gather
-    replay.gather = lambda chosen: np.add.at(counts, chosen, 1)  # type: ignore[method-assign,assignment,return-value]
-    replay.sample(draws, rng)
+    replay.gather = lambda chosen, _: np.add.at(counts, chosen, 1)  # type: ignore[method-assign,assignment,return-value]
+    replay.sample(draws, rng, ONE_STEP)
     replay.gather = original  # type: ignore[method-assign]
     expected = draws / len(slots)
     chi2 = float(((counts[slots] - expected) ** 2 / expected).sum())
@@ -227,7 +312,7 @@ def test_sampling_is_uniform_and_seeded() -> None:
 
 def test_nothing_to_sample() -> None:
     with pytest.raises(ValueError, match="no transition"):
-        FrameReplay(10, 1, (1,), np.float32, 1).sample(2, np.random.default_rng(0))
+        FrameReplay(10, 1, (1,), np.float32, 1).sample(2, np.random.default_rng(0), ONE_STEP)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

@@ -37,7 +37,11 @@ def batches(size: int = SIZE) -> list[Batch]:
     for _ in range(3):
         x = rng.integers(0, 2, (2, size, *shape)).astype(np.bool_)
         rewards = np.linspace(-2, 3, size).astype(np.float32)
-        made.append(Batch(x[0], rng.integers(0, 3, size), rewards, x[1], rng.random(size) < 0.3))
+        made.append(
+            Batch(
+                x[0], rng.integers(0, 3, size), rewards, x[1], rng.random(size) < 0.3, np.full(size, 0.99, np.float32)
+            )
+        )
     return made
 
 

@@ -17,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.replay.ring import Batch, FrameReplay
+from switchmt_snn.replay.ring import Batch, FrameReplay, Returns
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.updates import choice as machine
 from tests.conftest import small_config
@@ -47,7 +47,9 @@ def batch_of(seed: int) -> Batch:
     rng = np.random.default_rng(seed)
     images = (rng.random((2, 8, 4, 10, 10)) < 0.4).astype(np.uint8)
     rewards = rng.normal(size=8).astype(np.float32)
-    return Batch(images[0], rng.integers(0, 6, 8), rewards, images[1], rng.random(8) < 0.2)
+    return Batch(
+        images[0], rng.integers(0, 6, 8), rewards, images[1], rng.random(8) < 0.2, np.full(8, 0.99, np.float32)
+    )
 
 
 class _NoWordToTheHost(TorchDispatchMode):
@@ -118,10 +120,10 @@ def test_batches_are_gathered_where_the_network_lies() -> None:
             replay.add(0, step % 6, 1.0, False, (rng.random((4, 10, 10)) < 0.4).astype(np.uint8))
         learner = learner_of(config_of({}), CPU)
         for _ in range(3):
-            learner.update(replay.sample(8, rng), 1)
+            learner.update(replay.sample(8, rng, Returns()), 1)
         losses.append(learner.take_means())
     assert losses[0] == losses[1]
-    assert isinstance(replays[1].sample(2, rng).observations, torch.Tensor)
+    assert isinstance(replays[1].sample(2, rng, Returns()).observations, torch.Tensor)
 
 
 @cuda
@@ -155,7 +157,7 @@ def test_frames_on_the_gpu_are_those_of_the_plain_ring() -> None:
         for step in range(4000):
             frame = rng.integers(0, 256, (1, 84, 84), np.uint8)
             replay.add(step % 2, step % 18, 0.0, False, frame)
-    ours, theirs = (replay.sample(64, np.random.default_rng(1)) for replay in (there, plain))
+    ours, theirs = (replay.sample(64, np.random.default_rng(1), Returns()) for replay in (there, plain))
     assert isinstance(ours.observations, torch.Tensor)
     assert np.array_equal(ours.observations.cpu().numpy(), theirs.observations)
     assert np.array_equal(there.read_segment(next(there.segments())), plain.read_segment(next(plain.segments())))
