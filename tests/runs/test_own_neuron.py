@@ -1,4 +1,4 @@
-"""A neuron from outside the package (docs/extending.md, Neuron): trained, continued, evaluated; refused by name elsewhere."""
+"""A neuron from outside the package trains, continues and evaluates; what does not know it refuses it by name."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from switchmt_snn.export import ExportSettings, export
 
 ROOT = Path(__file__).parents[2]
 MODULE = '''
-"""A neuron whose membrane leaks the faster, the higher it is; and what is no neuron."""
+"""A neuron with a learned reset and two state variables; and a class that is no neuron."""
 import torch
 
 from switchmt_snn.spiking.neurons import NeuronLayer
 
 
-class QuadraticLeak(NeuronLayer):
-    """U(t) = U(t-1) - leak U(t-1)^2 + I(t), reset to zero by the last step's spike; a fatigue counts spikes."""
+class PartialReset(NeuronLayer):
+    """A spike removes a learned share of the membrane and raises the threshold of the next step."""
 
     STATE = ("membrane", "fatigue")
 
     def __init__(self, config):
         super().__init__(config)
         self.threshold = config.threshold
-        self.leak = torch.nn.Parameter(torch.tensor(0.25))
+        self.share = torch.nn.Parameter(torch.tensor(0.75))
 
     def step(self, current_t, state):
         membrane, fatigue = state
-        fired = self.surrogate(membrane - self.threshold).detach()
-        membrane = (1.0 - fired) * (membrane - self.leak * membrane.square()) + current_t
-        spikes_t = self.surrogate(membrane - self.threshold)
-        return spikes_t, (membrane, 0.5 * fatigue + spikes_t)
+        fired = self.surrogate(membrane - self.threshold - fatigue).detach()
+        membrane = (1.0 - self.share.clamp(0, 1) * fired) * membrane + current_t
+        fatigue = 0.5 * fired
+        return self.surrogate(membrane - self.threshold - fatigue), (membrane, fatigue)
 
 
 class NoNeuron:
@@ -69,7 +69,13 @@ def own_config(**network: object) -> ExperimentConfig:
             "threads": 1,
             "device": "cpu",
             "tasks": {"suite": "minatar", "names": ["breakout", "asterix"]},
-            "network": {"hidden_units": 16, "timesteps": 2, "neuron": "own_neurons:QuadraticLeak", **network},
+            "network": {
+                "hidden_units": 16,
+                "timesteps": 3,
+                "threshold": 0.25,
+                "neuron": "own_neurons:PartialReset",
+                **network,
+            },
             "learning": {
                 "batch_size": 8,
                 "learning_starts_steps": 50,
@@ -87,6 +93,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return load_file(max(run.glob("checkpoints/step-*")) / "model.safetensors")
 
 
+@pytest.mark.slow
 def test_an_own_neuron_trains_continues_in_another_process_and_evaluates(module: Path, tmp_path: Path) -> None:
     config = own_config()
     train(config, run=tmp_path / "whole")
@@ -95,12 +102,12 @@ def test_an_own_neuron_trains_continues_in_another_process_and_evaluates(module:
     result = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, cwd=ROOT)
     assert result.returncode == 0, result.stdout + result.stderr
     whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
-    leaks = [name for name in whole if name.endswith("neurons.leak")]
-    assert len(leaks) == 3, "one layer of the trunk, two streams"
-    assert all(float(whole[name]) != 0.25 for name in leaks), "parameters of an own neuron are trained"
+    shares = [name for name in whole if name.endswith("neurons.share")]
+    assert len(shares) == 3, "one layer of the trunk, two streams"
+    assert all(float(whole[name]) != 0.75 for name in shares), "parameters of an own neuron are trained"
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
-    assert "neuron: own_neurons:QuadraticLeak" in (tmp_path / "whole" / "config.yaml").read_text()
+    assert "neuron: own_neurons:PartialReset" in (tmp_path / "whole" / "config.yaml").read_text()
 
     evaluation = evaluate(tmp_path / "whole", save=False)
     assert {row.task for row in evaluation.tasks} == {"breakout", "asterix"}
@@ -109,14 +116,15 @@ def test_an_own_neuron_trains_continues_in_another_process_and_evaluates(module:
     assert agent.q_values(observations, "asterix").shape == (1, len(agent.suite.action_names))
 
 
+@pytest.mark.slow
 def test_what_does_not_know_an_own_neuron_refuses_it_by_name(module: Path, tmp_path: Path) -> None:
     config = own_config()
     native = replace(config, learning=replace(config.learning, engine="native"))
-    with pytest.raises(ConfigError, match=r"no code for network\.neuron=own_neurons:QuadraticLeak"):
+    with pytest.raises(ConfigError, match=r"no code for network\.neuron=own_neurons:PartialReset"):
         train(native, run=tmp_path / "native")
     train(replace(config, total_steps=60), run=tmp_path / "run")
     for settings in (ExportSettings(onnx=True, nir=False), ExportSettings(onnx=False, nir=True)):
-        with pytest.raises(ExportError, match="own_neurons:QuadraticLeak"):
+        with pytest.raises(ExportError, match="own_neurons:PartialReset"):
             export(tmp_path / "run", settings=settings)
 
 

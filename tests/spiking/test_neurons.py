@@ -12,6 +12,7 @@ import snntorch
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ConfigError
@@ -22,6 +23,7 @@ from switchmt_snn.spiking.neurons import (
     LeakyLayer,
     LeakyNode,
     NeuronLayer,
+    NeuronState,
     ReLULayer,
     SynapticNode,
     make_neuron_layer,
@@ -261,6 +263,24 @@ def test_the_sigmoid_surrogate_has_no_nan_far_below_the_threshold(neuron: str) -
     layer_of(neuron=neuron, surrogate="sigmoid")(current)[0].sum().backward()
     assert current.grad is not None
     assert current.grad.item() == 0.0
+
+
+class Refractory(LeakyLayer):
+    """LIF with a step of its own: it ignores the input of the step after a spike."""
+
+    def step(self, current_t: Tensor, state: NeuronState) -> tuple[Tensor, NeuronState]:
+        fired = (state[0] > self.leaky.threshold).to(current_t.dtype)
+        return super().step(current_t * (1.0 - fired), state)
+
+
+def test_an_inherited_fast_form_never_replaces_a_step_of_its_own() -> None:
+    layer = Refractory(NetworkConfig(neuron="LIF", beta=0.5))
+    spikes, (membrane,) = layer(torch.tensor([2.0, 2.0, 2.0]).view(-1, 1, 1))
+    assert spikes.flatten().tolist() == [1, 0, 1]  # 2 (fires); reset and no input: 0; 2 (fires)
+    assert float(membrane) == 2.0
+    assert layer.node(1).kind.endswith(":Refractory"), "nor may an exporter take it for LIF"
+    with pytest.raises(ConfigError, match="neuron_engine is 'snntorch', expected fused"):
+        Refractory(NetworkConfig(neuron_engine="snntorch"))
 
 
 def test_nodes_hold_a_layers_parameters() -> None:

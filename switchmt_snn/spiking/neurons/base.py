@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import snntorch
 import torch
@@ -60,8 +60,8 @@ class OpaqueNode(NeuronNode):
 class NeuronLayer(nn.Module):
     """A layer of neurons: input currents over T steps -> spikes over T steps. The state is passed in and returned.
 
-    A subclass defines ``STATE`` and ``step``. It may define ``node``, so that exporters can know it, and
-    ``run``, for a faster form of the same loop.
+    A subclass defines ``STATE`` and ``step``. It may define ``node``, so that exporters can know it, and ``run``, for a
+    faster form of the same loop. A class that changes an inherited step does not inherit these two.
 
     Attributes:
         STATE: names of the state variables.
@@ -71,6 +71,14 @@ class NeuronLayer(nn.Module):
 
     STATE: ClassVar[tuple[str, ...]] = ()
     ENGINES: ClassVar[tuple[str, ...]] = ("fused",)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """A class with a step of its own inherits no faster form, engine or description of another class's step."""
+        super().__init_subclass__(**kwargs)
+        if "step" in cls.__dict__:
+            for name in ("run", "node", "ENGINES"):
+                if name not in cls.__dict__:
+                    setattr(cls, name, NeuronLayer.__dict__[name])
 
     def __init__(self, config: NetworkConfig) -> None:
         """Check the settings that all models share.
