@@ -27,6 +27,8 @@ from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
 from switchmt_snn.spiking.encodings import ENCODINGS
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
 from switchmt_snn.spiking.neurons import NEURONS, LeakyLayer, NeuronLayer, NeuronState
+from switchmt_snn.spiking.neurons.base import RESETS
+from switchmt_snn.spiking.readout import READOUTS
 from tests.export.export_cases import VARIANTS, make_agent, observations
 
 
@@ -74,12 +76,12 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
 @settings(max_examples=int(os.environ.get("EXPORT_EXAMPLES", "20")), deadline=None)
 @given(
     method=st.sampled_from(METHODS),
-    reset=st.sampled_from(["zero", "subtract"]),
+    reset=st.sampled_from(RESETS),
     timesteps=st.sampled_from([1, 2, 4, 8]),
     dendrites=st.sampled_from(["shared", "per_neuron"]),
     encoding=st.sampled_from(sorted(ENCODINGS)),
     neuron=st.sampled_from(list(NEURONS)),
-    readout=st.sampled_from(["mean", "last_membrane", "max_membrane"]),
+    readout=st.sampled_from(list(READOUTS)),
     normalization=st.sampled_from(["per_task", "shared"]),
     seed=st.integers(0, 2**20),
 )
