@@ -18,6 +18,7 @@ import numpy as np
 from docs.tools.energy_page import energy_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
+from docs.tools.recipe_page import recipe_page
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import field_documentation, load_config
 from switchmt_snn.export.report.page import microjoule
@@ -348,6 +349,7 @@ PAGES = {
     "results/minatar/README.md": minatar_page,
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,
+    "results/recipe/README.md": recipe_page,
     "docs/performance.md": performance_page,
     "docs/picture.svg": picture,
 }

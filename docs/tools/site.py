@@ -22,6 +22,7 @@ OUTSIDE = {
     "results/minatar.md": "results/minatar/README.md",
     "results/export.md": "results/export/README.md",
     "results/profile.md": "results/profile/README.md",
+    "results/recipe.md": "results/recipe/README.md",
 }
 """Page of the site -> file of the repository."""
 

@@ -78,6 +78,9 @@ class NetworkConfig:
     keeps all."""
     normalization: Literal["per_task", "shared"] = "per_task"
     """BatchNorm running statistics for each task, or one set for all (affine weights are always shared)."""
+    stream_normalization: Literal["none", "batch"] = "none"
+    """BatchNorm of each stream's input currents before the dendritic gain, with weight and bias fixed at half the
+    threshold: no parameter is added, and it keeps the streams' neurons from falling silent. none: the paper."""
     normalization_momentum: float = 0.1
     """BatchNorm momentum of the running statistics."""
     neuron_engine: Literal["fused", "snntorch"] = "fused"

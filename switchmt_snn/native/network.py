@@ -64,6 +64,7 @@ class NativeNetwork:
         streams = [cast(Stream, stream) for stream in network.streams.values()]
         self._streams = Synapses([stream.synapses for stream in streams], self._dtype)
         self._gains = Gains(streams)
+        self._stream_norms = [stream.normalization for stream in streams if stream.normalization is not None]
         self._synapses = [*(layer.synapses for layer in self._trunk.values()), self._streams]
         self._heads = Heads(network)
         of_trunk = [part for layer in self._trunk.values() for part in layer.parameters]
@@ -151,7 +152,10 @@ class NativeNetwork:
         # Others first: training moves the running statistics.
         others = [self._features(other, parameters, training=False) for other in other_inputs]
         ys, of_streams = connected([self._features(x, parameters, training, layers), *others], self._streams)
-        fired = [self._neurons.fire(y_TBN, Currents(parameters.gain_N), self._last_form) for y_TBN in ys]
+        # Others first here, too.
+        currents = [self._stream_currents(y_TBN, parameters, training=False) for y_TBN in ys[1:]]
+        currents = [self._stream_currents(ys[0], parameters, training), *currents]
+        fired = [self._neurons.fire(y, current, self._last_form) for y, current in zip(ys, currents, strict=True)]
         outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
         # The backward keeps only the first input's activations alive, and not its own outputs.
         y_TBN, (spikes_SBN, currents_4N), shape = ys[0], fired[0], outputs[0].shape
@@ -166,7 +170,9 @@ class NativeNetwork:
             scale = 1.0 / steps if self._is_mean else 1.0
             grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBA, scale)
             grad_TBN = grad_SBN.expand(steps, -1, -1)
-            grad_y, (grad_gain_N, _) = self._neurons.fire_backward(y_TBN, currents_4N, grad_TBN)
+            grad_y, (grad_gain_N, grad_shift_N) = self._neurons.fire_backward(y_TBN, currents_4N, grad_TBN)
+            if self._stream_norms:  # the gain scales the normalized current, and its constant shift
+                grad_gain_N = (grad_gain_N + grad_shift_N) * self._stream_norms[0].weight[0]
             of_gains = self._gains.gradients(task, grad_gain_N)
             grad_x, of_synapses = of_streams(grad_y, True)
             parts = [*of_synapses, *of_gains, *of_heads]
@@ -177,6 +183,25 @@ class NativeNetwork:
             return parts
 
         return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], backward
+
+    def _stream_currents(self, y_TBN: Tensor, parameters: TaskParameters, training: bool) -> Currents:
+        """How the streams' currents come from their products: the gain, of the normalized product if that is set."""
+        if not self._stream_norms:
+            return Currents(parameters.gain_N)
+        norms, (task, gain_N, _) = self._stream_norms, parameters
+        # Copies: streams have statistics of their own, and moving those must not change what other inputs read.
+        mean_N, variance_N = (
+            torch.cat(parts) for parts in zip(*(norm.statistics(task) for norm in norms), strict=True)
+        )
+        if training:
+            moved = mean_N, variance_N
+            mean_N, variance_N = batch_moments(y_TBN, moved, norms[0].momentum)
+            sizes = [len(norm.weight) for norm in norms]
+            for norm, *parts in zip(norms, *(values_N.split(sizes) for values_N in moved), strict=True):
+                for held, part in zip(norm.statistics(task), parts, strict=True):
+                    held.copy_(part)
+        scale_N = gain_N * norms[0].weight[0]  # weight and bias are one constant
+        return Currents(scale_N, scale_N, mean_N, variance_N, norms[0].epsilon)
 
     def _features(
         self, x: Tensor, parameters: TaskParameters, training: bool, layers: list[Gradients] | None = None

@@ -18,7 +18,7 @@ from switchmt_snn.native import library as native_library
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.network import Convolution, QNetwork, Stream, TrunkLayer
 from switchmt_snn.spiking.neurons import LeakyLayer
-from switchmt_snn.spiking.normalization import TaskBatchNorm
+from switchmt_snn.spiking.normalization import FixedBatchNorm, TaskBatchNorm
 
 _ANY = object()
 _SETTINGS: dict[str, object] = {
@@ -46,6 +46,7 @@ _SETTINGS: dict[str, object] = {
     "dendritic_gating": ("max", "absolute_max"),
     "k_winners": (None,),
     "normalization": ("per_task", "shared"),
+    "stream_normalization": ("none", "batch"),
     "normalization_momentum": _ANY,
     "neuron_engine": ("fused",),
 }
@@ -78,8 +79,7 @@ def unsupported_module(network: QNetwork) -> str | None:
     for name, stream in network.streams.items():
         if type(stream) is not Stream:
             return _named(f"streams.{name}", stream)
-        modules = {"synapses": stream.synapses, "dendrites": stream.dendrites, "neurons": stream.neurons}
-        modules["head"] = stream.head
+        modules = {part: getattr(stream, part) for part in _STREAM_PARTS}
         for part, module in modules.items():
             if not _STREAM_PARTS[part](module):
                 return _named(f"streams.{name}.{part}", module)
@@ -166,6 +166,7 @@ _TRUNK_PARTS: dict[str, _Check] = {
 }
 _STREAM_PARTS: dict[str, _Check] = {
     "synapses": lambda module: type(module) is nn.Linear and module.bias is not None,
+    "normalization": lambda module: module is None or type(module) is FixedBatchNorm,
     "dendrites": lambda module: module is None or type(module) is ActiveDendrites,
     "neurons": _is_neurons,
     "head": lambda module: type(module) is nn.Linear and module.bias is not None,

@@ -40,7 +40,7 @@ from switchmt_snn.spiking.layers import (
 )
 from switchmt_snn.spiking.network import Convolution, ObservationSpec, QNetwork, Stream, TrunkLayer
 from switchmt_snn.spiking.neurons import NeuronLayer
-from switchmt_snn.spiking.normalization import TaskBatchNorm
+from switchmt_snn.spiking.normalization import FixedBatchNorm, TaskBatchNorm
 
 
 @dataclass(frozen=True)
@@ -316,14 +316,18 @@ def _trunk_layer(name: str, module: nn.Module, input_shape: tuple[int, ...], tas
     _require(module, TrunkLayer, name)
     layer = cast(TrunkLayer, module)
     node = _synapses(name, layer.synapses, input_shape, tasks)
-    norm = layer.normalization
-    if norm is not None:
-        _require(norm, TaskBatchNorm, f"the normalization of {name}")
-        for task in tasks:
-            mean_O, var_O = (_float64(value) for value in norm.statistics(task))
-            node.scale_KO[task] = _float64(norm.weight) / np.sqrt(var_O + norm.epsilon)
-            node.shift_KO[task] = (node.shift_KO[task] - mean_O) * node.scale_KO[task] + _float64(norm.bias)
+    if layer.normalization is not None:
+        _require(layer.normalization, TaskBatchNorm, f"the normalization of {name}")
+        _normalize(node, layer.normalization, tasks)
     return Layer(node, _neurons(layer.neurons, len(node.weight), name))
+
+
+def _normalize(node: SynapseNode, norm: TaskBatchNorm, tasks: range) -> None:
+    """Fold BatchNorm into a node's scale and shift, in place."""
+    for task in tasks:
+        mean_O, var_O = (_float64(value) for value in norm.statistics(task))
+        node.scale_KO[task] = _float64(norm.weight) / np.sqrt(var_O + norm.epsilon)
+        node.shift_KO[task] = (node.shift_KO[task] - mean_O) * node.scale_KO[task] + _float64(norm.bias)
 
 
 def _stream(name: str, module: nn.Module, features: tuple[int, ...], tasks: range) -> StreamNodes:
@@ -334,11 +338,14 @@ def _stream(name: str, module: nn.Module, features: tuple[int, ...], tasks: rang
         _require(getattr(stream, part), nn.Linear, f"{name}.{part}")
     hidden = _dense(f"{name}.hidden", stream.synapses, features, tasks)
     outputs = len(hidden.weight)
+    if stream.normalization is not None:
+        _require(stream.normalization, FixedBatchNorm, f"the normalization of {name}")
+        _normalize(hidden, stream.normalization, tasks)
     if stream.dendrites is not None:
         _require(stream.dendrites, ActiveDendrites, f"the dendrites of {name}")
         with torch.no_grad():
             gain_KO = np.stack([np.broadcast_to(_float64(stream.dendrites(k)), (outputs,)) for k in tasks])
-        hidden = replace(hidden, scale_KO=gain_KO, shift_KO=gain_KO * hidden.shift_KO, gated=True)
+        hidden = replace(hidden, scale_KO=gain_KO * hidden.scale_KO, shift_KO=gain_KO * hidden.shift_KO, gated=True)
     if stream.k_winners is not None and stream.k_winners < outputs:
         hidden = replace(hidden, k_winners=stream.k_winners)
     neurons = _neurons(stream.neurons, outputs, name)

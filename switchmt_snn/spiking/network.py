@@ -29,7 +29,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.dendrites import keep_k_winners, make_dendrites
 from switchmt_snn.spiking.encodings import make_encoding
 from switchmt_snn.spiking.neurons import NeuronLayer, NeuronState, make_neuron_layer
-from switchmt_snn.spiking.normalization import TaskBatchNorm
+from switchmt_snn.spiking.normalization import TaskBatchNorm, make_stream_normalization
 from switchmt_snn.spiking.readout import make_readout
 from switchmt_snn.spiking.settings import require_known
 
@@ -113,26 +113,33 @@ class TrunkLayer(nn.Module):
 
 
 class Stream(nn.Module):
-    """Linear, dendritic gain, neurons, linear head: one Q, value or advantage stream."""
+    """Linear, normalization (if set), dendritic gain, neurons, linear head: one Q, value or advantage stream."""
 
     def __init__(self, config: NetworkConfig, num_features: int, num_outputs: int, num_tasks: int, spiking: bool):
         super().__init__()
         hidden = cast(int, config.hidden_units)
         self.synapses = nn.Linear(num_features, hidden)
+        self.normalization = make_stream_normalization(config, hidden, num_tasks)
         self.dendrites = make_dendrites(config, hidden, num_tasks)
         self.k_winners = config.k_winners
         self.neurons = make_neuron_layer(config, spiking)
         self.head = nn.Linear(hidden, num_outputs)
 
     def context(self, task: int) -> tuple[Tensor, ...]:
-        """The dendrites' index of a task ``[1]``; nothing without dendrites."""
-        return () if self.dendrites is None else (self.dendrites.index(task),)
+        """The running mean and variance ``[N]`` with normalization, then the dendrites' index of a task ``[1]``."""
+        statistics = () if self.normalization is None else self.normalization.statistics(task)
+        return statistics if self.dendrites is None else (*statistics, self.dendrites.index(task))
 
-    def current(self, x_TBN: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None = None) -> Tensor:
+    def current(
+        self, x_TBN: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None, training: bool
+    ) -> Tensor:
         """Gated input currents ``[T, B, N]`` of the hidden neurons: Eq. 1's ``f(sum_i s_i, max_j d_j^T c)``."""
         current_TBN = synaptic_products(self.synapses, x_TBN, precision)
+        if self.normalization is not None:
+            folded = self.normalization.normalize(current_TBN.flatten(0, 1), context[:2], training)
+            current_TBN = folded.unflatten(0, x_TBN.shape[:2])
         if self.dendrites is not None:
-            current_TBN = current_TBN * self.dendrites.gains(*context)
+            current_TBN = current_TBN * self.dendrites.gains(context[-1])
         if self.k_winners is not None:
             current_TBN = keep_k_winners(current_TBN, self.k_winners)
         return current_TBN
@@ -258,7 +265,9 @@ class QNetwork(nn.Module):
             x = self._fire(name, cast(TrunkLayer, layer), current, state, activity)
         features_TBN = x.flatten(2)
         outputs = {
-            name: self._read_out(name, cast(Stream, stream), features_TBN, context[name], state, activity, precision)
+            name: self._read_out(
+                name, cast(Stream, stream), features_TBN, context[name], state, activity, precision, training
+            )
             for name, stream in self.streams.items()
         }
         return self.readout.q_values(self.combine(outputs))
@@ -289,8 +298,10 @@ class QNetwork(nn.Module):
         state: State,
         activity: dict[str, Tensor] | None,
         precision: torch.dtype | None,
+        training: bool,
     ) -> Tensor:
-        spikes_TBN = self._fire(name, stream, stream.current(features_TBN, context, precision), state, activity)
+        current_TBN = stream.current(features_TBN, context, precision, training)
+        spikes_TBN = self._fire(name, stream, current_TBN, state, activity)
         return self.readout.stream(stream.head, spikes_TBN)
 
     def combine(self, outputs: dict[str, Tensor]) -> Tensor:

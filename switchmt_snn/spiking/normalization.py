@@ -10,6 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from switchmt_snn.config import NetworkConfig
+from switchmt_snn.errors import ConfigError
+
 
 class TaskBatchNorm(nn.Module):
     """BatchNorm over ``[B, C, ...]`` with running mean and variance for each task (rows of ``[K, C]`` buffers).
@@ -54,3 +57,31 @@ class TaskBatchNorm(nn.Module):
         """Running mean and variance ``[C]`` that eval mode uses for a task (views of the buffers)."""
         row = task if self.running_mean_KC.shape[0] > 1 else 0
         return self.running_mean_KC[row], self.running_var_KC[row]
+
+
+class FixedBatchNorm(TaskBatchNorm):
+    """BatchNorm whose weight and bias are one constant, not parameters: ``(y - mean) / std * value + value``.
+
+    With half the threshold as value, a neuron's current has half the threshold as mean and as standard deviation, so
+    that it neither stays silent nor fires at every step. CaRe-BN (ICLR 2026) does so in spiking Q-networks.
+    """
+
+    def __init__(self, num_channels: int, num_tasks: int, per_task: bool, momentum: float, value: float) -> None:
+        super().__init__(num_channels, num_tasks, per_task, momentum)
+        del self.weight, self.bias
+        self.register_buffer("weight", torch.full((num_channels,), value), persistent=False)
+        self.register_buffer("bias", torch.full((num_channels,), value), persistent=False)
+
+
+def make_stream_normalization(config: NetworkConfig, num_neurons: int, num_tasks: int) -> FixedBatchNorm | None:
+    """The normalization of a stream's currents that ``config.stream_normalization`` names.
+
+    Raises:
+        ConfigError: unknown name.
+    """
+    if config.stream_normalization == "none":
+        return None
+    if config.stream_normalization == "batch":
+        per_task, value = config.normalization == "per_task", config.threshold / 2
+        return FixedBatchNorm(num_neurons, num_tasks, per_task, config.normalization_momentum, value)
+    raise ConfigError(f"network.stream_normalization is {config.stream_normalization!r}, expected none or batch")

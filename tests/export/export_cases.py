@@ -38,6 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "ALIF subtract": {"neuron": "ALIF", "adaptation_strength": 0.5, "reset": "subtract"},
     "learned": {"neuron": "LIF", "learn_beta": True, "learn_threshold": True},
     "shared statistics": {"normalization": "shared"},
+    "stream normalization": {"stream_normalization": "batch"},
     "mlp": {"trunk": "mlp"},
     "T 7": {"timesteps": 7},
     "T 1": {"timesteps": 1},
@@ -59,8 +60,9 @@ def make_agent(seed: int = 0, **network: Any) -> Agent:
                 shape = module.running_mean_KC.shape
                 module.running_mean_KC.copy_(torch.randn(shape, generator=generator) * 0.1)
                 module.running_var_KC.copy_(torch.rand(shape, generator=generator) * 0.2 + 0.02)
-                module.weight.copy_(torch.randn(shape[1], generator=generator))
-                module.bias.copy_(torch.randn(shape[1], generator=generator) * 0.5)
+                if isinstance(module.weight, torch.nn.Parameter):  # else fixed
+                    module.weight.copy_(torch.randn(shape[1], generator=generator))
+                    module.bias.copy_(torch.randn(shape[1], generator=generator) * 0.5)
     return Agent(built, suite, config, torch.device("cpu"), 1234)
 
 

@@ -126,3 +126,35 @@ def test_networks_without_bits_compute_the_same_to_rounding(
         # A bias before normalisation has none except rounding.
         scale = 1.0 if "conv" in name and "synapses.bias" in name else float(their_grads[name].abs().max())
         torch.testing.assert_close(grad, their_grads[name], rtol=1e-3, atol=1e-4 * scale + 1e-7, msg=name)
+
+
+@pytest.mark.parametrize("method", ["SwitchMT", "DSQN_D", "MTSpark_AD"])
+@pytest.mark.parametrize("dendrites", ["shared", "per_neuron"])
+def test_normalized_streams_equal_eager(method: str, dendrites: str) -> None:
+    """Q-values of training and of other inputs, gradients, and running statistics of the batch's task only."""
+    spec = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
+    settings_ = {"method": method, "trunk": "minatar", "stream_normalization": "batch", "threshold": 0.4}
+    settings_ |= {} if method == "DSQN_D" else {"dendrites": dendrites}
+    config = resolve(small_config(network=settings_)).network
+    ours, theirs = build_network(config, spec, 1), build_network(config, spec, 1)
+    native, generator = NativeNetwork(ours, None), torch.Generator()
+    for step in range(3):
+        x, other = torch.rand(2, 16, 4, 10, 10, generator=torch.Generator().manual_seed(step))
+        context = theirs.context(1)
+        with torch.no_grad():
+            expected_other = theirs.decide(theirs.encode(other), context, training=False)
+        expected = theirs.decide(theirs.encode(x), context, training=True)
+        inputs = [native.inputs(part, generator) for part in (x, other)]
+        q, q_other = native.decide(inputs[0], native.for_task(1), training=True, other_inputs=[inputs[1]])
+        torch.testing.assert_close(q, expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(q_other, expected_other, rtol=1e-4, atol=1e-5)
+        for network, values in ((ours, q), (theirs, expected)):
+            network.zero_grad()
+            values.square().mean().backward()
+        for (name, one), two in zip(ours.named_parameters(), theirs.parameters(), strict=True):
+            torch.testing.assert_close(one.grad, two.grad, rtol=1e-3, atol=1e-6, msg=name)
+        for name, value in theirs.named_buffers():
+            torch.testing.assert_close(ours.get_buffer(name), value, rtol=1e-4, atol=1e-6, msg=name)
+    for stream in ours.streams.values():
+        moved = [bool(stream.normalization.running_mean_KC[task].any()) for task in range(3)]
+        assert moved == [False, True, False]
