@@ -12,6 +12,7 @@ import torch
 
 from switchmt_snn.config import ExperimentConfig, resolve
 from switchmt_snn.config.yaml_io import from_dict
+from switchmt_snn.runs.plan import decide
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite, VectorStep
 
 
@@ -112,3 +113,11 @@ def vector_suite(
         references={},
         make=make,
     )
+
+
+def decided(
+    config: ExperimentConfig, stored: ExperimentConfig | None = None, processes: int = 1
+) -> tuple[ExperimentConfig, tuple[str, ...]]:
+    """What a run on a CPU decides, and its notes; of two tasks with four features."""
+    suite = vector_suite(lambda task, num_envs: CountingEnvironment(task, num_envs, 5), 4)
+    return decide(config, stored, suite, torch.device("cpu"), processes)

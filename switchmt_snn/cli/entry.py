@@ -386,7 +386,7 @@ def _doctor(argv: list[str]) -> int:
     from switchmt_snn.machine.memory import GIB, available_bytes
     from switchmt_snn.runs.environment import describe_environment
     from switchmt_snn.tasks.registry import SUITES
-    from switchmt_snn.updates.choice import built_engines
+    from switchmt_snn.updates.engine import ENGINES
 
     device = select_device("auto")
     facts = describe_environment(load_config("quickstart"), device)
@@ -396,7 +396,7 @@ def _doctor(argv: list[str]) -> int:
         "tasks": {name: len(suite.known_tasks()) for name, suite in SUITES.items()},
         "available_memory_gib": round(available_bytes() / GIB, 1),
         "bfloat16_instructions": has_bfloat16(device),
-        **built_engines(),
+        "update_engines": {name: engine.status() for name, engine in ENGINES.items()},
     }
     if options.json:
         print(json.dumps(facts))

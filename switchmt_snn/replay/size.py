@@ -18,8 +18,11 @@ def plain_frame_bytes(config: ExperimentConfig, suite: TaskSuite) -> int:
 
 
 def compresses_replay(config: ExperimentConfig, suite: TaskSuite) -> bool:
-    """Whether frames are kept compressed."""
+    """Whether frames are kept compressed; ``auto`` if plain ones would take more than 1 GiB, and never on a device.
+
+    A run's plan stores the answer in place of ``auto``.
+    """
     asked = config.learning.replay_compression
-    if config.learning.replay_on_device:
-        return False
-    return asked == "zstd" or (asked == "auto" and plain_frame_bytes(config, suite) > GIB)
+    if asked == "auto":
+        return not config.learning.replay_on_device and plain_frame_bytes(config, suite) > GIB
+    return {"zstd": True, "none": False}[asked]

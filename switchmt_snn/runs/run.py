@@ -16,7 +16,7 @@ import torch
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
-from switchmt_snn.config import ExperimentConfig, from_dict, load_config, resolve, to_dict
+from switchmt_snn.config import ExperimentConfig, from_dict, load_config, to_dict
 from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.events import Event, Stepped
@@ -25,14 +25,12 @@ from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
-from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, latest_run, new_run_path
 from switchmt_snn.runs.logs import RunLogs
-from switchmt_snn.runs.memory import require_gpu_memory, require_memory
+from switchmt_snn.runs.plan import decide, plan
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite
-from switchmt_snn.updates.choice import settle
 from switchmt_snn.updates.processes import ProcessGroup, join_processes
 
 BEST_WINDOW_EPISODES = 20
@@ -43,16 +41,16 @@ class Observer(Protocol):
     """Receives a run's events. It cannot change or stop the run."""
 
     def start(self, training: Training, folder: RunFolder, resumed_at: int | None) -> None:
-        """The run begins or continues."""
+        """The run begins (``resumed_at`` is None), or continues at that step."""
 
     def __call__(self, event: Event) -> None:
         """Something happened."""
 
     def note(self, text: str) -> None:
-        """Something that the user should read."""
+        """A text that the user should read."""
 
     def stop(self) -> None:
-        """The loop is over."""
+        """The training loop has ended."""
 
 
 @dataclass(frozen=True)
@@ -127,29 +125,24 @@ def _train(
     if policy is not None:
         switching = replace(config.switching, policy=plugin_name(policy, "policy"))
         config = replace(config, switching=switching)
-    device = select_device(config.device) if group is None else group.device(config.device)
-    processes = 1 if group is None else group.size
-    config, notes = settle(resolve(config), stored, device, processes)
+    planned = plan(config, stored) if group is None else plan(config, stored, group.size, group.device(config.device))
     if stored is not None:
-        check_same_config(settle(stored, stored, device)[0], config, folder.path)
-    suite = make_suite(config.tasks)
+        check_same_config(decide(stored, stored, planned.suite, planned.device)[0], planned.config, folder.path)
     torch.backends.cudnn.deterministic = True  # exact resume; benchmark mode would choose kernels by the clock
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
+    if planned.config.threads is not None:
+        torch.set_num_threads(planned.config.threads)
     keep_freed_memory()
-    require_memory(describe_method(config, suite).memory, config)
-    require_gpu_memory(config, suite)
     lock = folder.lock()
     try:
         if stored is None:
-            folder.create(config, describe_environment(config, device))
-        elif stored != config:
-            folder.save_config(config)
+            folder.create(planned.config, describe_environment(planned.config, planned.device))
+        elif stored != planned.config:
+            folder.save_config(planned.config)
         if group is not None:
-            group.share(to_dict(config))
-        training = Training(config, suite, device, group)
+            group.share(to_dict(planned.config))
+        training = Training(planned.config, planned.suite, planned.device, group)
         try:
-            return _Driver(folder, training, observers, notes).run()
+            return _Driver(folder, training, observers, planned.notes).run()
         finally:
             training.close()
     finally:
@@ -310,18 +303,24 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def load_agent(run: str | Path | None = None, checkpoint: str = "last", device: str = "auto") -> Agent:
+def load_agent(
+    run: str | Path | None = None, checkpoint: str = "last", device: str = "auto", threads: int | None = None
+) -> Agent:
     """The trained agent of a run.
 
     Args:
         run: run folder; None takes the newest under ``runs/``.
         checkpoint: ``last`` or ``best``.
         device: as in the config.
+        threads: CPU threads of PyTorch, for the whole process; None leaves them. With more than one a decision may be
+            faster, and sums may have another order.
 
     Raises:
         RunFolderError: no such run.
         CheckpointError: no whole checkpoint.
     """
+    if threads is not None:
+        torch.set_num_threads(threads)
     folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     config = folder.config()
     suite = make_suite(config.tasks)

@@ -14,8 +14,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.native import supports
 from switchmt_snn.native.network import NativeNetwork
 from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
-from switchmt_snn.updates import choice as machine
-from tests.conftest import small_config
+from tests.conftest import decided, small_config
 
 CPU = torch.device("cpu")
 
@@ -34,7 +33,7 @@ CPU = torch.device("cpu")
 def test_an_unsupported_setting_is_refused_by_name(setting: dict[str, Any], named: str) -> None:
     asked = small_config(network=setting, learning={"engine": "native"})
     with pytest.raises(ConfigError, match=f"learning.engine is 'native', .*it has no code for .*{named}.*eager"):
-        machine.settle(asked, None, CPU)
+        decided(asked)
 
 
 def test_every_network_setting_is_named_by_the_whitelist() -> None:

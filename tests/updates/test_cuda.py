@@ -19,8 +19,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.replay.ring import Batch, FrameReplay, Returns
 from switchmt_snn.spiking.network import ObservationSpec, build_network
-from switchmt_snn.updates import choice as machine
-from tests.conftest import small_config
+from tests.conftest import decided, small_config
 
 CPU = torch.device("cpu")
 IMAGES = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
@@ -101,7 +100,7 @@ def test_everything_that_an_update_changes_stays_where_it_is() -> None:
 
 def test_a_graph_needs_a_cuda_device() -> None:
     with pytest.raises(ConfigError, match=r"learning\.engine is 'graph', expected a run on a CUDA device.*cpu.*eager"):
-        machine.settle(config_of({}, engine="graph"), None, CPU)
+        decided(config_of({}, engine="graph"))
 
 
 @pytest.mark.parametrize("learning", [{"replay_on_device": True, "replay_compression": "zstd"}])

@@ -1,4 +1,4 @@
-"""The compiled update against the eager one, and what a run settles on."""
+"""Every update engine against the eager one."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from switchmt_snn.config import Engine, ExperimentConfig, resolve
 from switchmt_snn.config.yaml_io import load_config
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.machine.devices import has_bfloat16
 from switchmt_snn.spiking.network import ObservationSpec, build_network
-from switchmt_snn.updates import choice as machine
 from switchmt_snn.updates import compiled
 from switchmt_snn.updates.engine import ENGINES
 from tests.conftest import small_config
@@ -187,50 +187,12 @@ def test_only_eager_divides_updates_among_processes(name: str) -> None:
     assert reason is None or reason.startswith("torchrun started 2 processes")
 
 
-def test_a_run_keeps_the_engine_it_began_with() -> None:
-    asked = small_config(total_steps=10_000_000, learning={"precision": "auto"})
-    stored = small_config(learning={"engine": "eager", "precision": "float32"})
-    settled, _ = machine.settle(asked, stored, CPU)
-    assert (settled.learning.engine, settled.learning.precision) == ("eager", "float32")
-    before_the_choice = small_config(total_steps=10_000_000)  # a stored config without the field
-    assert machine.settle(asked, before_the_choice, CPU)[0].learning.engine == "eager"
-
-
-@compiles
-def test_auto_compiles_long_runs_only() -> None:
-    short, no_words = machine.settle(small_config(), None, CPU)
-    long, words = machine.settle(small_config(total_steps=compiled.COMPILE_FROM_UPDATES), None, CPU)
-    assert (short.learning.engine, no_words) == ("eager", [])
-    assert long.learning.engine == "compiled"
-    assert len(words) == 1
-    assert "first" in words[0]
-    every = {"update_every_steps": 4, "update_tasks": "all"}  # two tasks: one update per two steps
-    assert compiled.planned_updates(small_config(total_steps=1000, learning=every)) == 500
-
-
-def test_without_a_compiler_auto_says_so_and_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled, "compile_problem", lambda: "no g++")
-    settled, words = machine.settle(small_config(total_steps=compiled.COMPILE_FROM_UPDATES), None, CPU)
-    assert settled.learning.engine == "eager"
-    assert "no g++" in words[0]
-    with pytest.raises(ConfigError, match=r"learning\.engine is 'compiled'.*no g\+\+.*eager"):
-        machine.settle(small_config(learning={"engine": "compiled"}), None, CPU)
-
-
-@pytest.mark.parametrize(("there", "precision"), [(True, "bfloat16"), (False, "float32")])
-def test_auto_precision_follows_the_processor(monkeypatch: pytest.MonkeyPatch, there: bool, precision: str) -> None:
-    monkeypatch.setattr(machine, "has_bfloat16", lambda device: there)
-    settled, words = machine.settle(small_config(learning={"precision": "auto"}), None, CPU)
-    assert settled.learning.precision == precision
-    assert precision in words[0]
-
-
 def test_bfloat16_instructions_are_those_that_the_system_lists() -> None:
     listing = Path("/proc/cpuinfo")
     if not listing.exists():
         pytest.skip("no /proc/cpuinfo")
     flags = listing.read_text()
-    assert machine.has_bfloat16(CPU) == ("avx512_bf16" in flags or "amx_tile" in flags)
+    assert has_bfloat16(CPU) == ("avx512_bf16" in flags or "amx_tile" in flags)
 
 
 @pytest.mark.slow

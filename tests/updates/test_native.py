@@ -10,9 +10,8 @@ import torch
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.native import library as native_library
 from switchmt_snn.native import supports
-from switchmt_snn.updates import choice as machine
 from switchmt_snn.updates.native import Native
-from tests.conftest import small_config
+from tests.conftest import decided, small_config
 
 CPU = torch.device("cpu")
 
@@ -21,8 +20,8 @@ def settled(trunk: str, precision: str, engine: str = "auto", method: str = "Swi
     asked = small_config(
         network={"trunk": trunk, "method": method}, learning={"precision": precision, "engine": engine}
     )
-    config, notes = machine.settle(asked, None, CPU)
-    return config.learning.engine, notes
+    config, notes = decided(asked)
+    return config.learning.engine, list(notes)
 
 
 @pytest.mark.parametrize(
@@ -64,10 +63,10 @@ def test_a_failing_compiler_is_named_with_what_to_do(tmp_path: Path, monkeypatch
     native_library.library.cache_clear()
     try:
         with pytest.raises(ConfigError, match=r"a C\+\+ compiler .*no-such-compiler'\); use learning.engine=eager"):
-            machine.settle(asked, None, CPU)
+            decided(asked)
         with pytest.raises(ConfigError, match=r"this run was begun, .*compiler'\); start another run \(--run OTHER"):
-            machine.settle(small_config(), asked, CPU)
+            decided(small_config(), asked)
         with pytest.raises(ConfigError, match=r"is 'native', expected .*compiler'\); use learning.engine=eager"):
-            machine.settle(asked, eager, CPU)  # not the engine it was begun with
+            decided(asked, eager)  # not the engine it was begun with
     finally:
         native_library.library.cache_clear()

@@ -13,8 +13,7 @@ import torch
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.training import make_learner
 from switchmt_snn.tasks.registry import make_suite
-from switchmt_snn.updates import choice as machine
-from tests.conftest import small_config
+from tests.conftest import decided, small_config
 from tests.runs.test_resume import CONFIG, content
 from tests.updates.processes_case import config, outcome
 
@@ -67,7 +66,7 @@ def test_a_divided_run_resumes_exactly(tmp_path: Path) -> None:
 def test_a_batch_that_cannot_be_divided_is_refused(tmp_path: Path) -> None:
     for learning, words in (({"batch_size": 9}, "batch_size is 9"), ({"engine": "compiled"}, "'compiled'")):
         with pytest.raises(ConfigError, match=words):
-            machine.settle(small_config(learning=learning), None, torch.device("cpu"), processes=2)
+            decided(small_config(learning=learning), processes=2)
     path = tmp_path / "odd.yaml"
     path.write_text(CONFIG.replace("batch_size: 8", "batch_size: 9"))
     assert "expected a multiple of the 2 processes" in torchrun("switchmt_snn", "train", path, check=1)

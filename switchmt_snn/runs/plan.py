@@ -1,0 +1,192 @@
+"""What a run will do, before it starts: every ``auto`` is decided here, once, and stored in the run's config.
+
+In this order:
+
+- ``resolve``: what follows from the config alone (policy, dendrites, T of an ANN) and from the
+  suite's defaults (trunk, hidden units, frame stack).
+- precision, engine and compression (``decide``), which follow from the machine and from the run's length.
+- memory: a run that cannot fit is refused.
+
+``device`` stays as it was asked for, so that a run can be continued on another machine; the run's environment.json
+names the device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.machine.devices import has_bfloat16, select_device
+from switchmt_snn.replay.size import compresses_replay
+from switchmt_snn.runs.description import describe_method
+from switchmt_snn.runs.memory import MemoryEstimate, require_gpu_memory, require_memory
+from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.tasks.suite import TaskSuite
+from switchmt_snn.updates.engine import ENGINES
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that is known about a run before it starts.
+
+    Attributes:
+        config: what the run stores; no setting except ``device`` is ``auto``.
+        suite: its tasks.
+        device: where the network will be.
+        memory: what the run will need.
+        notes: choices that the user should know about, each with its reason.
+    """
+
+    config: ExperimentConfig
+    suite: TaskSuite
+    device: torch.device
+    memory: MemoryEstimate
+    notes: tuple[str, ...]
+
+
+def plan(
+    config: ExperimentConfig,
+    stored: ExperimentConfig | None = None,
+    processes: int = 1,
+    device: torch.device | None = None,
+) -> Plan:
+    """Plan a run.
+
+    Args:
+        config: what is asked for.
+        stored: the config of the run that is continued; None for a new run.
+        processes: number of processes that divide each update (``torchrun``).
+        device: where the network will be; None takes the one that the config asks for.
+
+    Raises:
+        ConfigError: the machine does not have the device or engine that is asked for, the batch cannot be divided, or
+            the run does not fit into memory.
+        TaskError: a task does not exist or cannot be learned by a Q-network.
+    """
+    config = resolve(config)
+    if device is None:
+        device = select_device(config.device)
+    suite = make_suite(config.tasks)
+    config, notes = decide(config, stored, suite, device, processes)
+    memory = describe_method(config, suite).memory
+    require_memory(memory, config)
+    require_gpu_memory(config, suite)
+    return Plan(config, suite, device, memory, notes)
+
+
+def decide(
+    config: ExperimentConfig,
+    stored: ExperimentConfig | None,
+    suite: TaskSuite,
+    device: torch.device,
+    processes: int = 1,
+) -> tuple[ExperimentConfig, tuple[str, ...]]:
+    """Replace ``auto`` in precision, engine and compression by what this machine can do.
+
+    A run that exists keeps what it began with, because precision and engine change roundings. Runs from before these
+    settings existed began with float32 and the eager engine.
+
+    Args:
+        config: resolved.
+        stored: the config of the run that is continued; None for a new run.
+        suite: the config's tasks.
+        device: where the network will be.
+        processes: number of processes that divide each update.
+
+    Returns:
+        the config, and what the user should know about the choices.
+
+    Raises:
+        ConfigError: an engine is asked for that this machine does not have, or the batch cannot be divided.
+    """
+    if processes > 1:
+        _require_divisible(config, processes)
+    precision, notes = _precision(config, stored, device)
+    config = _with(config, precision=precision)
+    engine, engine_notes = _engine(config, stored, device, processes)
+    config = _with(config, engine=engine, replay_compression=_compression(config, stored, suite))
+    return config, (*notes, *engine_notes)
+
+
+def _with(config: ExperimentConfig, **learning: str) -> ExperimentConfig:
+    values: dict[str, Any] = {**learning}
+    return replace(config, learning=replace(config.learning, **values))
+
+
+def _precision(
+    config: ExperimentConfig, stored: ExperimentConfig | None, device: torch.device
+) -> tuple[str, list[str]]:
+    """bfloat16 if the hardware multiplies it faster than float32."""
+    asked = config.learning.precision
+    if asked == "auto" and stored is not None:
+        asked = stored.learning.precision
+    if asked != "auto":
+        return asked, []
+    hardware = "processor" if device.type == "cpu" else f"device {device.type}"
+    if has_bfloat16(device):
+        return "bfloat16", [f"updates compute in bfloat16: the {hardware} has bfloat16 instructions"]
+    return "float32", [f"updates compute in float32: the {hardware} has no bfloat16 instructions"]
+
+
+def _engine(
+    config: ExperimentConfig, stored: ExperimentConfig | None, device: torch.device, processes: int
+) -> tuple[str, list[str]]:
+    """The first engine that says of itself that it is worth its costs for this run, and that this machine has."""
+    asked = config.learning.engine
+    if asked == "auto" and stored is not None:
+        asked = "eager" if stored.learning.engine == "auto" or processes > 1 else stored.learning.engine
+    if asked != "auto":
+        reason = ENGINES[asked].unavailable(config, device, processes)
+        if reason is not None:
+            begun = stored is not None and stored.learning.engine == asked
+            raise _unavailable(asked, reason, begun)
+        return asked, []
+    notes: list[str] = []
+    for name, engine in ENGINES.items():
+        if processes > 1 and not engine.torchrun:
+            continue
+        if not engine.pays(config, device, config.learning.precision):
+            continue
+        reason = engine.unavailable(config, device, processes)
+        if reason is None:
+            return name, [*notes, engine.note] if engine.note else notes
+        notes.append(f"updates do not use the {name} engine: {reason}")
+    raise ConfigError(f"learning.engine is 'auto', expected one engine that works: {'; '.join(notes)}")
+
+
+def _unavailable(engine: str, reason: str, begun: bool) -> ConfigError:
+    origin = ", with which this run was begun" if begun else ""
+    remedy = "start another run (--run OTHER --learning.engine eager)" if begun else "use learning.engine=eager"
+    return ConfigError(
+        f"learning.engine is {engine!r}{origin}, expected {ENGINES[engine].needs}, but {reason}; {remedy}"
+    )
+
+
+def _compression(config: ExperimentConfig, stored: ExperimentConfig | None, suite: TaskSuite) -> str:
+    """Compressed if plain frames would take more than 1 GiB, and never on a device."""
+    if config.learning.replay_compression == "auto" and stored is not None:
+        config = _with(config, replay_compression=stored.learning.replay_compression)
+    return "zstd" if compresses_replay(config, suite) else "none"
+
+
+def _require_divisible(config: ExperimentConfig, processes: int) -> None:
+    if config.learning.replay_on_device:
+        raise ConfigError(
+            f"learning.replay_on_device is True, expected False for the {processes} processes that torchrun started: "
+            "batches are dealt out from the host"
+        )
+    if config.learning.engine not in ("auto", "eager"):
+        raise ConfigError(
+            f"learning.engine is {config.learning.engine!r}, expected eager or auto for the {processes} processes that "
+            "torchrun started"
+        )
+    size = config.learning.batch_size
+    if size % processes or size // processes < 2:
+        raise ConfigError(
+            f"learning.batch_size is {size}, expected a multiple of the {processes} processes that torchrun started, "
+            "with two transitions for each; change one of the two"
+        )
