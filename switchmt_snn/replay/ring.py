@@ -89,7 +89,7 @@ class FrameReplay:
         >>> replay = FrameReplay(capacity_steps=100, num_lanes=1, frame_shape=(2,), dtype=np.float32, stack=1)
         >>> replay.begin(0, np.array([0.0, 0.0], np.float32))
         >>> replay.add(0, action=1, reward=0.5, terminated=False, next_frame=np.array([1.0, 2.0], np.float32))
-        >>> batch = replay.sample(batch_size=1, rng=np.random.default_rng(0), Returns())
+        >>> batch = replay.sample(batch_size=1, rng=np.random.default_rng(0), returns=Returns())
         >>> batch.next_observations.tolist(), batch.rewards.tolist()
         ([[1.0, 2.0]], [0.5])
     """
