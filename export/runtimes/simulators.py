@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,9 @@ import numpy as np
 import torch
 
 from switchmt_snn.export.runtimes.nir_interpreter import Float
+
+_importing = threading.Lock()
+"""Simulators run in threads and share packages (matplotlib) that fail when two threads import them at once."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,8 @@ class Simulator:
 
 def _norse(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
     """Unbatched, as its Flatten(0, -1) asks for: one observation after the other."""
-    import norse.torch
+    with _importing:
+        import norse.torch
 
     network = norse.torch.from_nir(graph, ignore_warnings=True, dt=dt)
     return _one_by_one(lambda x, state: network(x, state), inputs_TB)
@@ -53,7 +58,8 @@ def _norse(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
 
 def _nirtorch(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
     """nirtorch with maps of our own: its default ones replace biases by random numbers (2.6)."""
-    import nirtorch
+    with _importing:
+        import nirtorch
 
     maps: dict[type[nir.NIRNode], Callable[[Any], torch.nn.Module]] = {
         nir.Affine: _affine,
@@ -66,7 +72,8 @@ def _nirtorch(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
 
 
 def _spikingjelly(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
-    from spikingjelly.activation_based.nir_exchange import import_from_nir
+    with _importing:
+        from spikingjelly.activation_based.nir_exchange import import_from_nir
 
     network = import_from_nir(graph, dt=dt)
     state, outputs = None, []
@@ -78,9 +85,10 @@ def _spikingjelly(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
 
 
 def _sinabs(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
-    import sinabs.activation
-    import sinabs.layers
-    import sinabs.nir
+    with _importing:
+        import sinabs.activation
+        import sinabs.layers
+        import sinabs.nir
 
     steps, batch = inputs_TB.shape[:2]
     network = sinabs.nir.from_nir(graph, batch_size=batch)
