@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -21,9 +22,9 @@ from switchmt_snn.export.formats.onnx_writer import OPSET, decision_model, step_
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
-from switchmt_snn.export.recording import Recording, file_name, recorded_plays
+from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, read_nir
-from switchmt_snn.runs.files import write_atomically
+from switchmt_snn.runs.files import file_name, write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
@@ -258,8 +259,15 @@ def _runtime(
         return OnnxAgent(_exported(folder, "decision.onnx", "--onnx"), suite, config, threads)
     if runtime != "nir":
         raise ExportError(f"the runtime is {runtime!r}, expected onnx or nir")
-    paths = {name: _exported(folder, f"{file_name(name)}.nir", "--nir") for name in suite.names}
+    paths = {name: _exported_nir(folder, name) for name in suite.names}
     return NirAgent({name: read_nir(path) for name, path in paths.items()}, suite, config)
+
+
+def _exported_nir(folder: RunFolder, task: str) -> Path:
+    """The task's NIR file, also under the name that version 0.1.0 gave to a task with a slash."""
+    old_name = re.sub(r"[^A-Za-z0-9_.-]", "_", task) + ".nir"
+    is_old = old_name != f"{file_name(task)}.nir" and (folder.path / "export" / old_name).is_file()
+    return _exported(folder, old_name if is_old else f"{file_name(task)}.nir", "--nir")
 
 
 def _exported(folder: RunFolder, name: str, flag: str) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ import numpy.typing as npt
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
 from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.runs.files import file_name
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -41,11 +41,6 @@ class Recording:
     actions: npt.NDArray[np.int64]
     epsilon: float
     seed: int
-
-
-def file_name(task: str) -> str:
-    """A task's name as part of a file's name (Gymnasium ids hold slashes)."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", task)
 
 
 def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recording]:

@@ -16,15 +16,17 @@ if TYPE_CHECKING:
     from switchmt_snn.config import ExperimentConfig
     from switchmt_snn.config.yaml_io import load_config
     from switchmt_snn.runs.run import evaluate, load_agent, train
+    from switchmt_snn.tasks.registry import register_suite
 
 __version__ = "0.1.0"
-__all__ = ["ExperimentConfig", "__version__", "evaluate", "load_agent", "load_config", "train"]
+__all__ = ["ExperimentConfig", "__version__", "evaluate", "load_agent", "load_config", "register_suite", "train"]
 
 _HOMES = {
     "ExperimentConfig": "switchmt_snn.config",
     "load_config": "switchmt_snn.config.yaml_io",
     "evaluate": "switchmt_snn.runs.run",
     "load_agent": "switchmt_snn.runs.run",
+    "register_suite": "switchmt_snn.tasks.registry",
     "train": "switchmt_snn.runs.run",
 }
 

@@ -38,7 +38,7 @@ def load_plugin(name: str, key: str) -> Any:
     """
     module_name, _, attribute = name.partition(":")
     try:
-        module = _script() if module_name == _script_name() else _imported(module_name)
+        module = import_plugin_module(module_name)
     except ImportError as error:
         raise ConfigError(
             f"{key} is {name!r}, expected an importable module, but importing {module_name!r} fails ({error}); "
@@ -51,6 +51,23 @@ def load_plugin(name: str, key: str) -> Any:
             f"{key} is {name!r}, expected a name that {module_name!r} defines, but it has no {attribute!r}; "
             "check the spelling"
         ) from None
+
+
+def import_plugin_module(module_name: str) -> ModuleType:
+    """Import a module from outside the package.
+
+    The script that runs is not imported a second time. The current folder is searched last, so that ``switchmt-snn``
+    finds modules that lie in it.
+
+    Raises:
+        ImportError: the module, or one that it imports, is not found.
+    """
+    if module_name == _script_name():
+        return _script()
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return importlib.import_module(module_name)
 
 
 def plugin_name(plugin: type[Any], key: str) -> PluginName:
@@ -97,14 +114,6 @@ def _plain(text: str) -> bool | int | float | str | None:
         with contextlib.suppress(ValueError):  # YAML 1.1 reads 1e-4 (no dot) as text
             return float(value)
     return value if isinstance(value, (bool, int, float, str)) else None
-
-
-def _imported(module_name: str) -> ModuleType:
-    """Import a module; the current folder is searched last, so that ``switchmt-snn`` finds modules that lie in it."""
-    folder = str(Path.cwd())
-    if folder not in sys.path:
-        sys.path.append(folder)
-    return importlib.import_module(module_name)
 
 
 def _script() -> ModuleType:

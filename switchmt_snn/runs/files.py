@@ -1,10 +1,39 @@
-"""Files that are whole or absent: written under a temporary name, synced, then renamed."""
+"""Files that are whole or absent (written under a temporary name, synced, then renamed), and their names."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 from pathlib import Path
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+_LONGEST_LIST = 120
+_NOT_TASKS = frozenset({"parity", "evaluation_onnx", "evaluation_nir"})
+"""Names of our own JSON files in a run's ``export`` folder, where each task has a JSON file, too."""
+
+
+def file_name(*tasks: str) -> str:
+    """Part of a file's name for some tasks: the same for the same tasks, another for others, and short.
+
+    A plain name stays as it is. Another one (``ALE/Pong-v5``, ``my_module:MyEnv-v0``) keeps its plain characters and
+    gets ``~`` and 16 digits of its SHA-256; ``~`` and ``+``, which joins several tasks, are in no plain name.
+
+    >>> file_name("breakout", "pong")
+    'breakout+pong'
+    >>> file_name("my_module:MyEnv-v0")
+    'my_module_MyEnv-v0~8e46a734f0f6d4fa'
+    """
+    joined = "+".join(map(_one_name, tasks))
+    return joined if len(joined) <= _LONGEST_LIST else _marked(joined, repr(tasks))
+
+
+def _one_name(task: str) -> str:
+    return task if _PLAIN_NAME.fullmatch(task) and task not in _NOT_TASKS else _marked(task, task)
+
+
+def _marked(text: str, hashed: str) -> str:
+    return f"{re.sub(r'[^A-Za-z0-9_.-]', '_', text)[:40].lstrip('.-')}~{sha256(hashed.encode())[:16]}"
 
 
 def write_atomically(path: Path, content: bytes) -> None:

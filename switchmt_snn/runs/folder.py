@@ -19,7 +19,7 @@ from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.checkpoint import CheckpointStore
-from switchmt_snn.runs.files import write_atomically
+from switchmt_snn.runs.files import file_name, write_atomically
 
 RUNS = Path("runs")
 
@@ -135,8 +135,8 @@ class RunFolder:
         """Write a summary (JSON) and the episodes (CSV) of an evaluation; returns the CSV's path."""
         folder = self.path / "evaluations"
         protocol = evaluation.protocol
-        tasks = {row.task for row in evaluation.tasks}
-        stem = f"{_evaluation_stem(evaluation.step)}_{'+'.join(sorted(tasks))}_n{protocol.episodes}_seed{protocol.seed}"
+        tasks = file_name(*sorted({row.task for row in evaluation.tasks}))
+        stem = f"{_evaluation_stem(evaluation.step)}_{tasks}_n{protocol.episodes}_seed{protocol.seed}"
         rows = [asdict(episode) for episode in evaluation.episodes]
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")

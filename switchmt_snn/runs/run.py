@@ -30,7 +30,8 @@ from switchmt_snn.runs.folder import RunFolder, check_same_config, latest_run, n
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.plan import decide, plan
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.tasks.registry import make_suite, register_suite
+from switchmt_snn.tasks.suite import Suite
 from switchmt_snn.updates.processes import ProcessGroup, join_processes
 
 BEST_WINDOW_EPISODES = 20
@@ -74,6 +75,7 @@ def train(
     run: str | Path | None = None,
     observers: Sequence[Observer] = (),
     policy: type[Criterion] | None = None,
+    suite: type[Suite] | None = None,
 ) -> RunResult:
     """Train, or continue a run.
 
@@ -84,6 +86,7 @@ def train(
         observers: progress displays and the like.
         policy: a switching criterion of your own in place of the config's. The run stores its name, so that it can be
             continued (docs/extending.md, Switching policy).
+        suite: a task suite of your own, likewise (docs/extending.md, Task and suite).
 
     Under ``torchrun`` the first process does all this, and every update is divided among all processes.
 
@@ -103,7 +106,7 @@ def train(
     try:
         if group is not None and group.rank > 0:
             return _serve(group)
-        return _train(config, run, observers, group, policy)
+        return _train(config, run, observers, group, policy, suite)
     finally:
         if group is not None:
             group.leave()
@@ -115,6 +118,7 @@ def _train(
     observers: Sequence[Observer],
     group: ProcessGroup | None,
     policy: type[Criterion] | None,
+    suite: type[Suite] | None,
 ) -> RunResult:
     if isinstance(config, (str, Path)):
         config = load_config(config)
@@ -123,8 +127,9 @@ def _train(
     if config is None:
         config = stored or load_config("quickstart")
     if policy is not None:
-        switching = replace(config.switching, policy=plugin_name(policy, "policy"))
-        config = replace(config, switching=switching)
+        config = replace(config, switching=replace(config.switching, policy=plugin_name(policy, "policy")))
+    if suite is not None:
+        config = replace(config, tasks=replace(config.tasks, suite=plugin_name(register_suite(suite), "suite")))
     planned = plan(config, stored) if group is None else plan(config, stored, group.size, group.device(config.device))
     if stored is not None:
         check_same_config(decide(stored, stored, planned.suite, planned.device)[0], planned.config, folder.path)

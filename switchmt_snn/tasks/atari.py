@@ -11,7 +11,7 @@ from ale_py.vector_env import AtariVectorEnv
 
 from switchmt_snn.config import TasksConfig, resolved_frame_stack
 from switchmt_snn.config.suites import SUITE_DEFAULTS
-from switchmt_snn.errors import TaskError, did_you_mean
+from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PUBLISHED_SCORES
 from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite, VectorStep
 
@@ -112,12 +112,9 @@ class AtariSuite(Suite):
         """Make the games.
 
         Raises:
-            TaskError: unknown game, or games of different action counts without ``full_action_space``.
+            TaskError: games of different action counts without ``full_action_space``.
         """
-        config, known = self.config, self.known_tasks()
-        for name in config.names:
-            if name not in known:
-                raise TaskError(f"tasks.names has the unknown Atari game {name!r}{did_you_mean(name, known)}")
+        config = self.config
         action_names = _action_names(config)
 
         def make(task: int, num_envs: int) -> TaskEnvironment:

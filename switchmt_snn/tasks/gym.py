@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.config import resolved_frame_stack
+from switchmt_snn.config.plugins import import_plugin_module
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError, did_you_mean
 from switchmt_snn.tasks.suite import Frames, Suite, TaskEnvironment, TaskSuite, VectorStep
@@ -91,6 +92,7 @@ class GymSuite(Suite):
     name = "gym"
     defaults = SUITE_DEFAULTS["gym"]
     examples = ("CartPole-v1", "Acrobot-v1")
+    open_names = True
     packages = ("gymnasium",)
 
     @classmethod
@@ -102,8 +104,7 @@ class GymSuite(Suite):
     def files(self) -> dict[str, Path]:
         """The modules that tasks name before a colon."""
         modules = dict.fromkeys(name.split(":")[0] for name in self.config.names if ":" in name)
-        specs = {module: importlib.util.find_spec(module) for module in modules}
-        return {module: Path(spec.origin) for module, spec in specs.items() if spec is not None and spec.origin}
+        return {module: Path(inspect.getfile(import_plugin_module(module))) for module in modules}
 
     def make(self) -> TaskSuite:
         """Make the environments.
@@ -161,18 +162,22 @@ def _frame_shape(name: str, env: Env) -> tuple[int, ...]:
 
 
 def _make_env(name: str) -> Env:
+    """The environment ``EnvId``, or ``module:EnvId`` after importing the module, as Gymnasium does."""
+    module, colon, env_id = name.partition(":")
+    if colon:
+        try:
+            import_plugin_module(module)
+        except ImportError as error:
+            raise TaskError(
+                f"tasks.names has {name!r}, expected an importable module before the colon, but importing {module!r} "
+                f"fails ({error}); install it, or add its folder to PYTHONPATH"
+            ) from error
     try:
-        return gymnasium.make(name)
+        return gymnasium.make(env_id if colon else name)
     except gymnasium.error.DependencyNotInstalled as error:
         raise TaskError(f"task {name!r} needs a package that is not installed ({error})") from error
     except ImportError as error:
-        if ":" in name:
-            module = name.split(":")[0]
-            raise TaskError(
-                f"tasks.names has {name!r}, expected an importable module before the colon, but importing {module!r} "
-                f"fails ({str(error).split('. ')[0]}); install it, or add its folder to PYTHONPATH"
-            ) from error
-        raise TaskError(f"task {name!r} cannot be made ({error})") from error
+        raise TaskError(f"task {name!r} cannot be made ({error}), expected all its packages; install them") from error
     except (gymnasium.error.Error, ValueError) as error:
-        hint = did_you_mean(name, gymnasium.registry.keys())
+        hint = did_you_mean(name, [f"{module}:{known}" if colon else known for known in gymnasium.registry])
         raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{hint}") from error

@@ -9,7 +9,7 @@ import numpy as np
 
 from switchmt_snn.config import TasksConfig, resolved_frame_stack
 from switchmt_snn.config.suites import SUITE_DEFAULTS
-from switchmt_snn.errors import MissingExtraError, TaskError, did_you_mean
+from switchmt_snn.errors import MissingExtraError
 from switchmt_snn.tasks.gym import Env, GymCopies, channels_first
 from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
 
@@ -41,13 +41,9 @@ class MinAtarSuite(Suite):
         """Make the games.
 
         Raises:
-            TaskError: unknown game.
             MissingExtraError: MinAtar is not installed.
         """
         config = self.config
-        for name in config.names:
-            if name not in GAMES:
-                raise TaskError(f"tasks.names has the unknown MinAtar game {name!r}{did_you_mean(name, GAMES)}")
         channels = max(int(_make_env(name, config).unwrapped.observation_space.shape[2]) for name in config.names)  # type: ignore[index]
         frame_shape = (channels, SIDE_CELLS, SIDE_CELLS)
 

@@ -9,7 +9,7 @@ import numpy as np
 from switchmt_snn.config import SuiteDefaults, TasksConfig, resolved_frame_stack
 from switchmt_snn.config.plugins import is_plugin, load_plugin, plugin_name
 from switchmt_snn.config.suites import register_defaults, require_suite_name
-from switchmt_snn.errors import ConfigError, TaskError
+from switchmt_snn.errors import ConfigError, TaskError, did_you_mean
 from switchmt_snn.tasks.atari import AtariSuite
 from switchmt_snn.tasks.gym import GymSuite
 from switchmt_snn.tasks.minatar import MinAtarSuite
@@ -68,9 +68,16 @@ def make_suite(config: TasksConfig) -> TaskSuite:
         TaskError: a task is unknown, does not fit a Q-network, or is not what its suite says.
         MissingExtraError: the suite needs an optional package.
     """
-    tasks = suite_of(config).make()
+    suite = suite_of(config)
+    known = suite.known_tasks()
+    for name in config.names:
+        if name not in known and not suite.open_names:
+            raise TaskError(f"tasks.names has the unknown {suite.name} task {name!r}{did_you_mean(name, known)}")
+    tasks = suite.make()
     stack, shape = resolved_frame_stack(config), tasks.valid_actions_KA.shape
+    readable = all(name and name.isprintable() and not set(name) & set(',"') for name in tasks.names)
     checks = (
+        (readable, f"names {tasks.names}", "printable names without commas and quotes, which tables could not hold"),
         (tasks.names == config.names, f"names {tasks.names}", f"those of the config, {config.names}"),
         (tasks.frame_stack == stack, f"frame_stack {tasks.frame_stack}", f"{stack}"),
         (len(tasks.frame_shape) in (1, 3), f"frame_shape {tasks.frame_shape}", "(features,) or (channels, H, W)"),

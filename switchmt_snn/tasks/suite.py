@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.config import SuiteDefaults, TasksConfig
+from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import TaskError, did_you_mean
 
 Frames = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
@@ -146,6 +147,7 @@ class Suite:
         name: short name, a value of ``tasks.suite`` once the suite is registered.
         defaults: frame stack and trunk where a config leaves them open.
         examples: tasks that can be learned together; tests and ``doctor`` use them.
+        open_names: whether there are tasks that ``known_tasks`` does not list; else an unknown one is refused.
         packages: distributions whose versions a run stores.
         frames_per_s: emulator frames per second of real time; None if the tasks have no clock.
         steps_to_learn: training for fewer agent steps teaches nothing, and a short run says so; None says nothing.
@@ -157,6 +159,7 @@ class Suite:
     name: ClassVar[str]
     defaults: ClassVar[SuiteDefaults]
     examples: ClassVar[tuple[str, ...]]
+    open_names: ClassVar[bool] = False
     packages: ClassVar[tuple[str, ...]] = ()
     frames_per_s: ClassVar[float | None] = None
     steps_to_learn: ClassVar[int | None] = None
@@ -167,17 +170,17 @@ class Suite:
         self.config = config
 
     def make(self) -> TaskSuite:
-        """Make the tasks of the config.
+        """Make the tasks of the config; ``switchmt_snn.tasks.registry.make_suite`` calls it with known names.
 
         Raises:
-            TaskError: a task does not exist, or does not fit a Q-network.
+            TaskError: a task cannot be made, or does not fit a Q-network.
             MissingExtraError: an optional package is needed.
         """
         raise NotImplementedError
 
     @classmethod
     def known_tasks(cls) -> tuple[str, ...]:
-        """Names of all tasks that are known; a suite of open names lists those that it finds."""
+        """Names of the tasks; a suite with ``open_names`` lists those that it finds."""
         return cls.examples
 
     @property
@@ -198,5 +201,8 @@ class Suite:
     @property
     def files(self) -> dict[str, Path]:
         """Files that decide what is learned, by a short name: a run stores their SHA-256. Here the suite's module."""
-        module = type(self).__module__
-        return {} if module.startswith("switchmt_snn.") else {module: Path(inspect.getfile(type(self)))}
+        suite = type(self)
+        if suite.__module__.startswith("switchmt_snn."):
+            return {}
+        module, _, _ = plugin_name(suite, "tasks.suite").partition(":")
+        return {module: Path(inspect.getfile(suite))}

@@ -151,7 +151,7 @@ def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypat
         (["train", "--learning.replay-capacity-steps", "999999999"], "lower learning.replay_capacity_steps to at most"),
         (["train", "--network.method", "best"], "invalid choice 'best'"),
         (["evaluate"], "expected one; run switchmt-snn train"),
-        (["describe", "--network.trunk", "minatar", "--tasks.names", "nope"], "unknown Atari game"),
+        (["describe", "--network.trunk", "minatar", "--tasks.names", "nope"], "unknown atari task"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_2(words: list[str], message: str, capsys, tmp_path, monkeypatch) -> None:

@@ -91,6 +91,13 @@ class Counting(Suite):
         return replace(tasks, names=self.config.names)
 
 
+class OpenCounting(Counting):
+    """Takes any name."""
+
+    name = "open_counting"
+    open_names = True
+
+
 @pytest.fixture
 def counting() -> Iterator[type[Suite]]:
     register_suite(Counting)
@@ -109,8 +116,20 @@ def test_a_registered_suite_is_stored_by_the_name_of_its_class(counting: type[Su
 
 
 def test_a_suite_is_found_by_the_name_of_its_class_without_being_registered() -> None:
-    config = TasksConfig(suite="tests.tasks.test_suites:Counting", names=("x",))
-    assert make_suite(config).names == ("x",)
+    config = TasksConfig(suite="tests.tasks.test_suites:Counting", names=("b",))
+    assert make_suite(config).names == ("b",)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_unknown_task_is_refused(name: str) -> None:
+    task = f"{SUITES[name].examples[0]}x"
+    with pytest.raises(TaskError, match=f"unknown .*{task!r}.*did you mean {SUITES[name].examples[0]!r}"):
+        make_suite(TasksConfig(suite=name, names=(task,)))
+
+
+def test_a_task_name_that_a_table_cannot_hold_is_refused() -> None:
+    with pytest.raises(TaskError, match="expected printable names without commas and quotes"):
+        make_suite(TasksConfig(suite="tests.tasks.test_suites:OpenCounting", names=("a,b",)))
 
 
 def test_a_registered_suite_may_be_registered_again_but_not_take_anothers_name(counting: type[Suite]) -> None:

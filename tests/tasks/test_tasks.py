@@ -158,7 +158,7 @@ def test_minatar_channels_are_padded() -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (TasksConfig(names=("pongg",)), "unknown Atari game 'pongg'; did you mean 'pong'"),
+        (TasksConfig(names=("pongg",)), "unknown atari task 'pongg'; did you mean 'pong'"),
         (TasksConfig(suite="minatar", names=("brekout",)), "did you mean 'breakout'"),
         (TasksConfig(suite="gym", names=("CartPole-v9",)), "unknown Gymnasium id 'CartPole-v9'"),
         (TasksConfig(suite="gym", names=("Nothing-v0",)), "unknown Gymnasium id"),

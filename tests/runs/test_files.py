@@ -1,0 +1,37 @@
+"""Names of files that hold tasks."""
+
+from __future__ import annotations
+
+import re
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from switchmt_snn.runs.files import file_name
+from switchmt_snn.tasks.registry import SUITES
+
+TASKS = st.one_of(
+    st.text(st.sampled_from("aB1_.-~+/: "), min_size=1, max_size=6),
+    st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=300),
+    st.sampled_from(["parity", "evaluation_onnx", "ALE/Pong-v5", "ALE_Pong-v5", "m:E-v0", "..", "-h"]),
+)
+LISTS = st.lists(TASKS, min_size=1, max_size=12, unique=True).map(tuple)
+
+
+@given(LISTS, LISTS)
+def test_other_tasks_have_another_file_name(one: tuple[str, ...], two: tuple[str, ...]) -> None:
+    assert (file_name(*one) == file_name(*two)) == (one == two)
+
+
+@given(LISTS)
+def test_file_names_are_safe_and_short(tasks: tuple[str, ...]) -> None:
+    name = file_name(*tasks)
+    assert re.fullmatch(r"[A-Za-z0-9_~][A-Za-z0-9_.+~-]*", name)
+    assert len(name) <= 120
+    assert name not in ("parity", "evaluation_onnx", "evaluation_nir")
+
+
+def test_names_of_known_tasks_stay_as_they_are() -> None:
+    for suite in SUITES.values():
+        assert all(file_name(task) == task for task in suite.known_tasks() if not set(task) & set("/:"))
+    assert file_name("breakout", "pong") == "breakout+pong"
