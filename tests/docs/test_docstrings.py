@@ -1,4 +1,4 @@
-"""Examples in docstrings run, in one folder and in this order: later ones read the run of the second."""
+"""Examples in docstrings run, in one folder and in this order: later ones read the run of ``train``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
 from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.learning.switching import SwitchingPolicy
 from switchmt_snn.replay.ring import FrameReplay
+from switchmt_snn.runs.files import file_name
 from switchmt_snn.runs.run import train
 
 EXAMPLES: tuple[Any, ...] = (
     load_config,
+    file_name,
     train,
     Agent.act,
     FrameReplay,
