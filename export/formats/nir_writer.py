@@ -176,12 +176,12 @@ def _(neurons: LeakyNode, chain: _Chain, layer: Layer, dialect: str) -> None:
     if neurons.reset == "subtract" and dialect == "legacy" and _decays(neurons.beta_O):
         raise ExportError(
             "LIF neurons reset by subtraction, expected IF for the NIR dialect 'legacy': its importers subtract at the "
-            "spike, before the membrane decays; use --nir-profile exact"
+            "spike, before the membrane decays; use --nir-dialect exact"
         )
     if neurons.reset == "subtract" and dialect in ("portable", "spikingjelly"):
         raise ExportError(
             f"the network resets by subtraction, expected reset to zero for the NIR dialect {dialect!r} (that is what "
-            "importers of nir.IF do); use --nir-profile exact (any simulator with loops) or legacy (sinabs)"
+            "importers of nir.IF do); use --nir-dialect exact (any simulator with loops) or legacy (sinabs)"
         )
     if _needs_loop(neurons, dialect):
         _append_loop(neurons, chain, layer, _DT[dialect])
@@ -195,7 +195,7 @@ def _(neurons: SynapticNode, chain: _Chain, layer: Layer, dialect: str) -> None:
         raise ExportError(
             f"Synaptic neurons reset by {neurons.reset!r} in the NIR dialect {dialect!r}, expected 'subtract' and "
             "exact: nir.CubaLIF resets at the spike, snnTorch's Synaptic after the next input; use --onnx, or "
-            "network.reset subtract and --nir-profile exact"
+            "network.reset subtract and --nir-dialect exact"
         )
     chain.append(f"{layer.name}_current", _integrator(layer, neurons.alpha_O, _DT[dialect]))
     _append_loop(neurons, chain, layer, _DT[dialect])

@@ -61,7 +61,7 @@ class ExperimentConfig:
 def resolve(config: ExperimentConfig) -> ExperimentConfig:
     """Replace every ``auto`` and null that has a rule; idempotent. A run stores the resolved config.
 
-    ``device`` stays: it names a wish ("the best that is there"), and the run's environment.json records the answer.
+    ``device`` stays, so that a run can be continued on another machine; its environment.json names the device.
     """
     traits = METHOD_TRAITS[config.network.method]
     network = config.network

@@ -1,4 +1,4 @@
-"""All cores for work that falls into independent parts."""
+"""All cores, for work in independent parts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 @contextmanager
 def all_cores() -> Iterator[ThreadPoolExecutor]:
-    """A thread for every core; PyTorch and NumPy's BLAS on one thread each meanwhile."""
+    """A pool with one thread per core. Until it ends, PyTorch and NumPy's BLAS use one thread each."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -9,19 +9,19 @@ import torch
 from switchmt_snn.errors import ConfigError
 
 
-def select_device(wish: str) -> torch.device:
-    """The device for a wish.
+def select_device(name: str) -> torch.device:
+    """The device that a config asks for; ``auto`` takes the first one of cuda, mps and cpu that this machine has.
 
     Raises:
-        ConfigError: the wished device is not there.
+        ConfigError: an unknown device, or one that this machine does not have.
     """
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if wish == "auto":
-        return torch.device(next(name for name, present in there.items() if present))
-    if not there[wish]:
-        present = ", ".join(name for name, is_there in there.items() if is_there)
-        raise ConfigError(f"device is {wish!r}, expected one that this machine has ({present}); use device=auto")
-    return torch.device(wish)
+    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if name == "auto":
+        return torch.device(next(device for device, is_available in available.items() if is_available))
+    if not available.get(name, False):
+        present = ", ".join(device for device, is_available in available.items() if is_available)
+        raise ConfigError(f"device is {name!r}, expected one that this machine has ({present}); use device=auto")
+    return torch.device(name)
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -35,13 +35,13 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def keep_freed_memory() -> bool:
-    """Let the C library keep what is freed instead of handing it back to the system at once.
+    """Let the C library keep freed memory instead of returning it to the system at once.
 
-    Activations of a large batch are allocated and freed at every update, and fresh pages cost more than the arithmetic
-    that is done on them. No number changes, and a process keeps its peak.
+    Every update allocates and frees the activations of a large batch, and new pages cost more than the arithmetic on
+    them. No result changes; a process keeps its peak memory.
 
     Returns:
-        whether the C library (glibc) can be told so.
+        whether the C library has this setting (glibc).
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -227,8 +227,10 @@ class CheckpointStore:
         """Weights of the last whole checkpoint or of the best one: step, state dict, damaged checkpoints passed over.
 
         Raises:
-            CheckpointError: there is none, or none is whole.
+            CheckpointError: ``which`` is neither ``last`` nor ``best``, or no such checkpoint is whole.
         """
+        if which not in ("last", "best"):
+            raise CheckpointError(f"the checkpoint is {which!r}, expected last or best")
         damaged: list[str] = []
         for path in [self.folder / "best"] if which == "best" else self.paths():
             try:

@@ -1,4 +1,4 @@
-"""Memory of a run before it starts: what it will need, what there is."""
+"""Memory that a run will need, and the refusal of one that does not fit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROCESS_BYTES = 700 * 1024**2
 """Python, torch, its kernels' scratch and the emulators (measured: 0.42 GiB before emulators and replay)."""
 
 COMPRESSION = 10
-"""By how much compressed frames are smaller, for the estimate (measured: 15 to 137 times, docs/performance.md)."""
+"""Plain size of frames divided by their compressed size, for the estimate (measured: 15 to 137, docs/performance.md)."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
     """
     slots = config.learning.replay_capacity_steps * len(suite.names)
     frames = plain_frame_bytes(config, suite)
-    if lies_on_gpu(config):
+    if is_on_gpu(config):
         frames = 0
     elif compresses_replay(config, suite):
         frames = int(min(frames / COMPRESSION, config.learning.replay_max_gib * GIB))
@@ -69,18 +69,18 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
     )
 
 
-def lies_on_gpu(config: ExperimentConfig) -> bool:
-    """Whether frames take no memory of the host."""
+def is_on_gpu(config: ExperimentConfig) -> bool:
+    """Whether the replay's frames are stored on a GPU, and so take no memory of the host."""
     return config.learning.replay_on_device and select_device(config.device).type == "cuda"
 
 
 def require_gpu_memory(config: ExperimentConfig, suite: TaskSuite) -> None:
-    """Refuse a run whose frames do not fit on the GPU that they shall lie on.
+    """Refuse a run whose frames do not fit into the memory of its GPU.
 
     Raises:
         ConfigError: with the numbers and what to do.
     """
-    if not lies_on_gpu(config):
+    if not is_on_gpu(config):
         return
     needed, available = plain_frame_bytes(config, suite), torch.cuda.mem_get_info()[0]
     if needed > available:

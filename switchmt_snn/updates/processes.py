@@ -64,9 +64,9 @@ class ProcessGroup:
         dist.init_process_group(backend, timeout=timedelta(days=7))  # the first process may evaluate for hours
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
 
-    def device(self, wish: str) -> torch.device:
+    def device(self, name: str) -> torch.device:
         """A requested device as this process's own: one GPU for each process of a machine."""
-        device = select_device(wish)
+        device = select_device(name)
         return torch.device(device.type, int(os.environ["LOCAL_RANK"])) if device.type == "cuda" else device
 
     def sum(self, x: Tensor) -> Tensor:

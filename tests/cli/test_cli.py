@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,9 @@ import torch
 import yaml
 
 from switchmt_snn.cli import main
+from switchmt_snn.cli.parsing import RENAMED
 from switchmt_snn.config import METHODS, POLICIES, ExperimentConfig, field_documentation
+from tests.cli.surface import SURFACE, options, surface
 from tests.spiking.test_network import TABLE_3
 
 ROOT = Path(__file__).parents[2]
@@ -181,21 +182,25 @@ def test_print_config_is_the_resolved_config(capsys) -> None:
     assert data["network"]["trunk"] == "nature"
 
 
-def test_command_line_surface_is_frozen(capsys) -> None:
-    """Every config field is a flag of train and describe; the commands' own flags are these."""
-    for command, own in (("train", {"--run", "--print-config", "--json"}), ("describe", {"--json"})):
-        _, out, _ = call(capsys, command, "--help")
-        flags = set(re.findall(r"(?<![\w-])--(?!no-)[a-z][\w.-]*", out))
+def test_command_line_surface_is_frozen() -> None:
+    """Every option of every command with its values: an added, removed or changed one fails."""
+    assert surface().splitlines() == SURFACE.read_text().splitlines(), "meant so? python -m tests.cli.surface"
+
+
+def test_every_setting_of_the_config_is_an_option_of_train_and_describe() -> None:
+    for command in ("train", "describe"):
+        flags = {flag for option in options(command) for flag in option.split() if flag.startswith("--")}
         fields = {"--" + key.replace("_", "-") for _, _, rows in field_documentation() for key, *_ in rows}
-        assert fields | own <= flags | {"--tasks.fire-on-reset"}, (fields | own) - flags
-    own_flags = {
-        "evaluate": "--episodes --epsilon --seed --num-envs --task --checkpoint --engine --json",
-        "export": "--onnx --nir --task --int8 --nir-profile --parity-decisions --checkpoint --out --json",
-        "profile": "--decisions --target --checkpoint --out --json",
-    }
-    for command, flags_text in own_flags.items():
-        _, out, _ = call(capsys, command, "--help")
-        assert set(flags_text.split()) <= set(re.findall(r"--[a-z][\w-]*", out)), command
+        assert fields <= flags, fields - flags
+
+
+@pytest.mark.parametrize(("command", "renamed"), RENAMED.items())
+@pytest.mark.parametrize("joined", [True, False])
+def test_older_spellings_of_flags_still_work(command: str, renamed: dict[str, str], joined: bool, capsys) -> None:
+    for old, new in renamed.items():
+        code, _, err = call(capsys, command, *([f"{old}=nothing"] if joined else [old, "nothing"]))
+        assert code == 2
+        assert f"invalid choice 'nothing' for argument '{new}'" in err
 
 
 def test_help_version_doctor(capsys) -> None:

@@ -236,9 +236,9 @@ def test_what_nir_cannot_say_is_refused() -> None:
     cases = {
         "DQN": "ReLU",
         "k winners": "k_winners",
-        "subtract": "--nir-profile exact",
+        "subtract": "--nir-dialect exact",
         "Synaptic": "nir.CubaLIF resets at the spike",
-        "Synaptic subtract": "--nir-profile exact",
+        "Synaptic subtract": "--nir-dialect exact",
         "ALIF": "NIR cannot express ALIF",
     }
     for variant, message in cases.items():

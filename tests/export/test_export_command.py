@@ -1,4 +1,4 @@
-"""``switchmt-snn export`` and ``evaluate --engine`` on a run folder, right and wrong."""
+"""``switchmt-snn export`` and ``evaluate --runtime`` on a run folder, right and wrong."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def test_export_writes_checks_and_the_files_play(trained_run: Path, run_command:
     assert beside["config_sha256"] == parity["config_sha256"]
     scores = {}
     for engine in ("torch", "onnx", "nir"):
-        out, _ = run_command("evaluate", trained_run, "--engine", engine, "--episodes", 4, "--json")
+        out, _ = run_command("evaluate", trained_run, "--runtime", engine, "--episodes", 4, "--json")
         result = json.loads(out)
         scores[engine] = [(row["task"], row["mean"], row["mean_length_steps"]) for row in result["tasks"]]
         assert engine == "torch" or result["equal_actions_share"] == 1.0
     assert scores["torch"] == scores["onnx"] == scores["nir"]
     assert json.loads((folder / "evaluation_nir.json").read_text())["equal_actions_share"] == 1.0
-    out, _ = run_command("evaluate", trained_run, "--engine", "onnx", "--episodes", 2, "--task", "asterix")
+    out, _ = run_command("evaluate", trained_run, "--runtime", "onnx", "--episodes", 2, "--task", "asterix")
     assert "100.00% of its decisions are those of the trained network" in out
 
 
@@ -85,7 +85,7 @@ def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: R
     for words, message in (
         ((tmp_path / "nowhere",), "no run folder"),
         ((trained_run, "--task", "pong"), "unknown task 'pong'"),
-        ((trained_run, "--nir-profile", "exakt"), "exakt"),
+        ((trained_run, "--nir-dialect", "exakt"), "exakt"),
         ((trained_run, "--nir", "--task", "asterix"), "expected --onnx with it"),
         ((trained_run, "--parity-decisions", "0"), "parity_decisions is 0, expected at least 1"),
         ((trained_run, "--out", trained_run / "config.yaml"), "config.yaml"),
@@ -94,18 +94,18 @@ def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: R
         _, err = run_command("export", *words, code=2)
         assert message in err
         assert len(err.strip().splitlines()) == 1, err
-    _, err = run_command("evaluate", trained_run, "--engine", "onnx", code=2)
+    _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
     assert f"run switchmt-snn export {trained_run} --onnx" in err
     run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
     (trained_run / "export" / "decision.onnx").write_bytes(b"damaged")
-    _, err = run_command("evaluate", trained_run, "--engine", "onnx", code=2)
+    _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
     assert "cannot be read" in err
 
 
 def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(trained_run: Path, run_command: RunCommand) -> None:
     run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
     run_command("train", "--run", trained_run, "--total-steps", 620)
-    _, err = run_command("evaluate", trained_run, "--engine", "onnx", code=2)
+    _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
     assert "of step 600, expected 620" in err
 
 

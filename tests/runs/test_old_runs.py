@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 
 from switchmt_snn import evaluate, load_agent, train
 from switchmt_snn.config import load_config
+from switchmt_snn.errors import CheckpointError
 from switchmt_snn.export import ExportSettings, export, load_exported, profile
 
 FIXTURES = Path(__file__).parents[1] / "fixtures" / "runs"
@@ -57,6 +58,11 @@ def test_an_old_run_evaluates_to_its_old_scores(old_run: Path) -> None:
     old_scores = {row["task"]: row["mean"] for row in json.loads(stored.read_text())["tasks"]}
     evaluation = evaluate(old_run, save=False)
     assert {row.task: row.mean for row in evaluation.tasks} == pytest.approx(old_scores)
+
+
+def test_an_unknown_checkpoint_is_refused(old_run: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"the checkpoint is 'bset', expected last or best"):
+        load_agent(old_run, checkpoint="bset")
 
 
 def test_old_onnx_files_decide_as_the_old_run_does(old_run: Path) -> None:

@@ -82,7 +82,7 @@ def test_own_environments_are_evaluated_and_exported_under_names_that_differ(env
         f"{file_name(task)}.{suffix}" for task in ENVS for suffix in ("nir", "json")
     }
     for runtime in ("onnx", "nir"):
-        played = json.loads(command(environments, "evaluate", "run", "--engine", runtime, "--json").stdout)
+        played = json.loads(command(environments, "evaluate", "run", "--runtime", runtime, "--json").stdout)
         assert played["equal_actions_share"] == 1.0
     command(environments, "profile", "run", "--decisions", "40")
 

@@ -1,0 +1,44 @@
+"""``switchmt-snn describe``: what a config would build."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from switchmt_snn.cli.parsing import leading_name, parse
+from switchmt_snn.config import ExperimentConfig, load_config, resolve
+
+
+@dataclass(frozen=True)
+class DescribeOptions:
+    """Describe what a config would build; every setting of the config is an option."""
+
+    experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
+    json: bool = False
+    """Print everything as JSON."""
+
+
+def command(argv: list[str]) -> int:
+    """Run the command; returns its exit code."""
+    source, rest = leading_name(argv)
+    # The paper's settings give the paper's table; a config of one's own gives its own.
+    default = load_config(source or "paper")
+    options = parse(DescribeOptions, rest, "describe", DescribeOptions(experiment=default))
+    from switchmt_snn.machine.memory import available_bytes
+    from switchmt_snn.runs.description import describe
+    from switchmt_snn.viewing.tables import layers_table, methods_table
+
+    config = resolve(options.experiment)
+    methods = describe(config)
+    if options.json:
+        facts: dict[str, Any] = {"config": config.name, "available_memory_bytes": available_bytes()}
+        print(json.dumps({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}}))
+        return 0
+    console = Console()
+    console.print(methods_table(methods))
+    console.print(layers_table(methods[config.network.method]))
+    return 0

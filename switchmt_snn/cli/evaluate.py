@@ -1,0 +1,66 @@
+"""``switchmt-snn evaluate``: play a run's agent and the random policy."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+
+from switchmt_snn.cli.parsing import leading_name, parse
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Play a run's agent and the random policy. Default of every setting: the run's own."""
+
+    episodes: int | None = None
+    """Episodes per task."""
+    epsilon: float | None = None
+    """Share of random actions."""
+    seed: int | None = None
+    """Seed of environments and random actions."""
+    num_envs: int | None = None
+    """Episodes played side by side."""
+    task: str | None = None
+    """Only this task."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Which weights."""
+    runtime: Literal["torch", "onnx", "nir"] = "torch"
+    """What plays. torch: the trained network. onnx: the run's ONNX file in onnxruntime. nir: its NIR files in the NIR
+    interpreter."""
+    json: bool = False
+    """Print the scores as JSON."""
+
+
+def command(argv: list[str]) -> int:
+    """Run the command; returns its exit code."""
+    run, rest = leading_name(argv)
+    options = parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
+    from switchmt_snn.runs.folder import latest_run
+    from switchmt_snn.runs.run import evaluate
+    from switchmt_snn.viewing.tables import evaluation_table
+
+    path = Path(run) if run is not None else latest_run()
+    names = ("episodes", "epsilon", "seed", "num_envs")
+    protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    facts: dict[str, Any] = {}
+    if options.runtime == "torch":
+        evaluation = evaluate(path, options.task, options.checkpoint, **protocol)
+    else:
+        from switchmt_snn.export.export_run import evaluate_exported
+
+        evaluation, share = evaluate_exported(options.runtime, path, options.task, options.checkpoint, **protocol)
+        facts = {"runtime": options.runtime, "equal_actions_share": share}
+    if options.json:
+        print(json.dumps({"run": str(path), **facts, **evaluation.to_dict()}))
+        return 0
+    Console().print(evaluation_table(evaluation))
+    if facts:
+        print(f"played by {options.runtime}; {share:.2%} of its decisions are those of the trained network")
+        print(path / "export" / f"evaluation_{options.runtime}.json")
+    else:
+        print(path / "evaluations")
+    return 0
