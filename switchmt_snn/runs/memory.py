@@ -20,7 +20,7 @@ PROCESS_BYTES = 700 * 1024**2
 """Python, torch, its kernels' scratch and the emulators (measured: 0.42 GiB before emulators and replay)."""
 
 COMPRESSION = 10
-"""Plain size of frames divided by their compressed size, for the estimate (measured: 15 to 137, docs/performance.md)."""
+"""Plain size of frames divided by their compressed size, for estimates (measured: 15 to 137; docs/performance.md)."""
 
 
 @dataclass(frozen=True)
