@@ -21,7 +21,7 @@ SIZE = 12
 
 
 def config() -> ExperimentConfig:
-    """A convolution with BatchNorm, dendrites, and rewards that are not clipped; gradients are clipped by norm."""
+    """A convolution with BatchNorm, and dendrites; gradients are clipped by norm."""
     return small_config(
         tasks={"suite": "minatar", "names": ["breakout", "asterix"]},
         network={"trunk": "minatar", "hidden_units": 16, "timesteps": 3, "threshold": 0.5, "dendrites": "per_neuron"},
@@ -36,7 +36,7 @@ def batches(size: int = SIZE) -> list[Batch]:
     made = []
     for _ in range(3):
         x = rng.integers(0, 2, (2, size, *shape)).astype(np.bool_)
-        rewards = np.linspace(-2, 3, size).astype(np.float32)
+        rewards = np.linspace(-2, 3, size).clip(-1, 1).astype(np.float32)
         made.append(
             Batch(
                 x[0], rng.integers(0, 3, size), rewards, x[1], rng.random(size) < 0.3, np.full(size, 0.99, np.float32)
