@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import pkgutil
+import re
 from pathlib import Path
 from types import ModuleType
 
@@ -58,3 +59,13 @@ def test_no_name_of_a_package_hides_one_of_its_modules(package: str) -> None:
     for module in pkgutil.iter_modules(namespace.__path__):
         found = vars(namespace).get(module.name)
         assert found is None or isinstance(found, ModuleType), f"{package}.{module.name} is a module and {found!r}"
+
+
+def test_files_that_messages_and_recipes_send_a_reader_to_define_the_name() -> None:
+    """As in "add it to Policy in switchmt_snn/config/switching.py"."""
+    texts = [*(path.read_text() for path in sources()), (ROOT / "docs" / "extending.md").read_text()]
+    pattern = re.compile(r"`?([A-Z]\w+)`? \(?(?:in )?`?(switchmt_snn/[\w/]+\.py)")
+    named = [match for text in texts for match in pattern.findall(text)]
+    assert {"Policy", "EncodingName", "ENCODINGS", "ENGINES", "Engine"} & {name for name, _ in named}
+    for name, file in named:
+        assert re.search(rf"^(class )?{name}\b", (ROOT / file).read_text(), re.MULTILINE), f"{name} in {file}"

@@ -34,7 +34,7 @@ def load_plugin(name: str, key: str) -> Any:
         key: the config key that holds the name, for the error.
 
     Raises:
-        ConfigError: the module cannot be imported, or has no such attribute.
+        ConfigError: the module cannot be imported, its code fails, or it has no such attribute.
     """
     module_name, _, attribute = name.partition(":")
     try:
@@ -42,7 +42,7 @@ def load_plugin(name: str, key: str) -> Any:
     except ImportError as error:
         raise ConfigError(
             f"{key} is {name!r}, expected an importable module, but importing {module_name!r} fails ({error}); "
-            "install it, or add its folder to PYTHONPATH"
+            "install it, add its folder to PYTHONPATH, or mend it"
         ) from error
     try:
         return getattr(module, attribute)
@@ -60,14 +60,19 @@ def import_plugin_module(module_name: str) -> ModuleType:
     finds modules that lie in it.
 
     Raises:
-        ImportError: the module, or one that it imports, is not found.
+        ImportError: the module, or one that it imports, is not found, or its code fails.
     """
     if module_name == _script_name():
         return _script()
     folder = str(Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)
-    return importlib.import_module(module_name)
+    try:
+        return importlib.import_module(module_name)
+    except ImportError:
+        raise
+    except Exception as error:  # whatever the module's own code raises
+        raise ImportError(" ".join(f"{type(error).__name__}: {error}".split())) from error
 
 
 def plugin_name(plugin: type[Any], key: str) -> PluginName:

@@ -103,3 +103,5 @@ def _require_complete(suite: object) -> None:
                 f"the suite {suite.__qualname__!r} states no {attribute}, expected a {kind.__name__}; "
                 "see docs/extending.md"
             )
+    if suite.make is Suite.make:
+        raise ConfigError(f"the suite {suite.__qualname__!r} defines no make, expected make(self) -> TaskSuite")

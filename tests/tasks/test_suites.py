@@ -148,7 +148,15 @@ class Nameless(Suite):
     """States nothing."""
 
 
+class Makeless(Suite):
+    """States its facts, but makes nothing."""
+
+    name, defaults, examples = "makeless", SuiteDefaults(frame_stack=1, trunk="mlp"), ("a",)
+
+
 def test_incomplete_suites_are_named() -> None:
+    with pytest.raises(ConfigError, match="the suite 'Makeless' defines no make"):
+        register_suite(Makeless)
     with pytest.raises(ConfigError, match="the suite 'Nameless' states no name"):
         register_suite(Nameless)
     with pytest.raises(ConfigError, match=r"expected a subclass of switchmt_snn.tasks.suite.Suite"):

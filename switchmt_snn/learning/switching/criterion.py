@@ -116,7 +116,7 @@ def register_criterion(name: str) -> Callable[[_C], _C]:
         if name not in POLICIES:
             raise ConfigError(
                 f"criterion {name!r} is not a value of switching.policy, expected one of {', '.join(POLICIES)}; add it "
-                "to Policy in switchmt_snn/config/experiment.py, or use package.module:Class"
+                "to Policy in switchmt_snn/config/switching.py, or use package.module:Class"
             )
         if CRITERIA.get(name, criterion) is not criterion:
             raise ConfigError(f"criterion {name!r} is {CRITERIA[name].__name__}, expected a name that is free")
