@@ -80,7 +80,7 @@ class NetworkConfig:
     """BatchNorm running statistics for each task, or one set for all (affine weights are always shared)."""
     stream_normalization: Literal["none", "batch"] = "none"
     """BatchNorm of each stream's input currents before the dendritic gain, with weight and bias fixed at half the
-    threshold: no parameter is added, and it keeps the streams' neurons from falling silent. none: the paper."""
+    threshold, so that fewer neurons are silent. It adds no parameter. none: the paper's network."""
     normalization_momentum: float = 0.1
     """BatchNorm momentum of the running statistics."""
     neuron_engine: Literal["fused", "snntorch"] = "fused"

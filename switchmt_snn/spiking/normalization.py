@@ -62,8 +62,9 @@ class TaskBatchNorm(nn.Module):
 class FixedBatchNorm(TaskBatchNorm):
     """BatchNorm whose weight and bias are one constant, not parameters: ``(y - mean) / std * value + value``.
 
-    With half the threshold as value, a neuron's current has half the threshold as mean and as standard deviation, so
-    that it neither stays silent nor fires at every step. CaRe-BN (ICLR 2026) does so in spiking Q-networks.
+    With half the threshold as value, a neuron's current has half the threshold as mean and as standard deviation over a
+    batch, so a current above the threshold is one standard deviation away. CaRe-BN (ICLR 2026) does so in spiking
+    Q-networks.
     """
 
     def __init__(self, num_channels: int, num_tasks: int, per_task: bool, momentum: float, value: float) -> None:
