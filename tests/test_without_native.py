@@ -98,14 +98,17 @@ def run(package: Path, program: str, *arguments: object, code: int = 0) -> str:
     return result.stdout + result.stderr
 
 
+@pytest.mark.slow
 def test_every_other_module_can_be_imported(package: Path) -> None:
     assert "modules" in run(package, IMPORTS)
 
 
+@pytest.mark.slow
 def test_eager_and_auto_updates_train(package: Path) -> None:
     run(package, TRAINING)
 
 
+@pytest.mark.slow
 def test_a_run_trains_and_exports_and_the_native_engine_is_refused_in_one_line(package: Path, tmp_path: Path) -> None:
     config = tmp_path / "tiny.yaml"
     config.write_text(CONFIG)

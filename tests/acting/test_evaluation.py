@@ -102,6 +102,7 @@ def test_summary_by_hand() -> None:
     assert row.human_normalized == pytest.approx(0.4)
 
 
+@pytest.mark.slow
 def test_one_task_and_unknown_tasks() -> None:
     agent = minatar_agent()
     assert {e.task for e in evaluate_agent(agent, PROTOCOL, ("asterix",)).episodes} == {"asterix"}

@@ -211,6 +211,7 @@ def test_help_version_doctor(capsys) -> None:
         assert out
 
 
+@pytest.mark.slow
 def test_importing_the_package_is_light() -> None:
     code = (
         "import sys, switchmt_snn; assert 'torch' not in sys.modules; switchmt_snn.train; assert 'torch' in sys.modules"

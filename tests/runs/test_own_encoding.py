@@ -30,6 +30,7 @@ def in_fresh_process(folder: Path, *command: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_an_encoding_from_outside_trains_continues_and_exports_with_its_rule(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

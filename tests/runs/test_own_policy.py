@@ -74,6 +74,7 @@ def test_a_policy_from_outside_trains_and_continues_in_a_fresh_process(folder: P
     assert list(decided[0])[-2:] == ["mean_return", "target"]
 
 
+@pytest.mark.slow
 def test_a_class_of_the_running_script_gets_the_name_of_the_script(folder: Path) -> None:
     trains = (folder / "train_own.py").read_text().replace("from my_policies import ReturnAbove\n", "")
     trains = trains.replace('load_config("own_policy.yaml")', 'load_config("short.yaml")')

@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.recipes import code_of
 
 
+@pytest.mark.slow
 def test_the_recipe_of_an_update_engine_runs(tmp_path: Path) -> None:
     module, script = code_of("Update engine")
     (tmp_path / "my_engines.py").write_text(module)
