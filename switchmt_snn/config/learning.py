@@ -39,6 +39,9 @@ class LearningConfig:
     """How updates are executed. eager: PyTorch. native: C++ (CPU only, compiled once in about 7 s). compiled:
     torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for Atari-size
     networks if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or more; else eager."""
+    acting: Literal["auto", "eager", "native"] = "auto"
+    """Who computes the actions of training. eager: PyTorch in float32. native: the native engine, in the precision of
+    its updates. Evaluation is always eager. auto: native with engine native, else eager."""
     clip_rewards: bool = True
     """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward."""
     replay_capacity_steps: int = 1_048_576

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -64,7 +64,7 @@ class Learner(Stateful):
     the running statistics of the batch's task.
 
     Attributes:
-        updates: gradient steps made. ``engine`` executes them; acting is always eager and in float32.
+        updates: gradient steps made. ``engine`` executes them, and computes actions if ``learning.acting`` says so.
     """
 
     SAVED: ClassVar[tuple[str, ...]] = (
@@ -82,6 +82,7 @@ class Learner(Stateful):
         "device",
         "engine",
         "_clip",
+        "_decisions",
         "_invalid_KA",
         "_loss",
         "_step",
@@ -118,6 +119,7 @@ class Learner(Stateful):
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
         self._trained = list(self.network.parameters())
         self.engine = (engine or engine_class(config.engine))(self.network, self.target, config)
+        self._decisions = self._acting(config.acting)
         self.optimizer = self.engine.optimizer()
         self.generator = torch.Generator(device).manual_seed(seed)
         self._step = self.engine.executed(self._device_step, self.optimizer, self.generator)
@@ -127,13 +129,27 @@ class Learner(Stateful):
         self.q_sum = torch.zeros((), device=device)
         self.summed = 0
 
+    def _acting(self, acting: str) -> Callable[[Tensor, int, torch.Generator], Tensor]:
+        """What computes the Q-values that training acts by. A learner made without a run takes ``auto`` as eager."""
+        if acting in ("auto", "eager"):
+            return self._eager_decisions
+        if acting != self.engine.name or not self.engine.acts:
+            raise ConfigError(
+                f"learning.acting is {acting!r}, expected eager or an engine that acts, but learning.engine is "
+                f"{self.engine.name!r}; use learning.acting=eager"
+            )
+        return self.engine.decisions
+
+    def _eager_decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
+        self.network.eval()
+        return cast(Tensor, self.network(observations, task, generator=generator))
+
     def act(self, observations: npt.NDArray[np.generic], task: int) -> npt.NDArray[np.int64]:
         """Greedy actions ``[B]`` for raw stacked observations ``[B, ...]`` of a task (eval mode)."""
-        self.network.eval()
         with torch.inference_mode():
-            q_BA = self.network(self._tensor(observations), task, generator=self.generator)
+            q_BA = self._decisions(self._tensor(observations), task, self.generator)
             q_BA = q_BA.masked_fill(self._invalid_KA[task], -torch.inf)
-            return q_BA.argmax(dim=1).cpu().numpy()  # type: ignore[no-any-return]
+            return q_BA.argmax(dim=1).cpu().numpy()
 
     def update(self, batch: Batch, task: int) -> None:
         """One gradient step on a batch of one task."""

@@ -28,6 +28,10 @@ Backward = Callable[[Tensor], list[Tensor]]
 """From the gradient of the heads' outputs to those of ``NativeNetwork._differentiated``."""
 
 
+_FEW_LANES = 32
+"""T * B up to which dense products of the streams are faster than those of bits (16 lanes: 0.6 and 3.0 ms)."""
+
+
 class TaskParameters(NamedTuple):
     """What a task changes in a network; valid until the network's parameters change."""
 
@@ -116,6 +120,24 @@ class NativeNetwork:
             self._by_task[task] = TaskParameters(task, gain_N, self._contexts[task])
         return self._by_task[task]
 
+    def act(self, x: Tensor, parameters: TaskParameters) -> Tensor:
+        """Q-values ``[B, A]`` in eval mode, without a gradient; ``decide`` for the few observations of a step.
+
+        The trunk's last spikes are dense if they are few, because a panel of bits has 64 lanes, filled or not.
+
+        Args:
+            x: of ``inputs``.
+            parameters: of ``for_task``.
+        """
+        dense: Form | None = "dense" if self._neurons.timesteps * x.shape[1] <= _FEW_LANES else None
+        with torch.no_grad():
+            features = self._features(x, parameters, training=False, last=dense)
+            (y_TBN,), _ = connected([features], self._streams)
+            currents = self._stream_currents(y_TBN, parameters, training=False)
+            spikes_SBN, _ = self._neurons.fire(y_TBN, currents, self._last_form)
+            output_SBA = self._heads.outputs(spikes_SBN)
+        return self._q_values(output_SBA[0] if self._is_mean else output_SBA)
+
     def decide(
         self, x: Tensor, parameters: TaskParameters, training: bool, other_inputs: Sequence[Tensor] = ()
     ) -> list[Tensor]:
@@ -132,10 +154,14 @@ class NativeNetwork:
         else:
             with torch.no_grad():
                 outputs, _ = self._outputs(x, parameters, training, other_inputs, None)
+        return [self._q_values(output) for output in outputs]
+
+    def _q_values(self, output: Tensor) -> Tensor:
+        """``[B, A]`` of a head's output ``[B, A]`` (``mean`` readout) or ``[T, B, A]``."""
         if self._is_mean:
-            return list(outputs)
+            return output
         readout = self._network.readout
-        return [readout.q_values(readout.integrate(output_TBA)) for output_TBA in outputs]
+        return readout.q_values(readout.integrate(output))
 
     def _outputs(
         self,
@@ -204,12 +230,21 @@ class NativeNetwork:
         return Currents(scale_N, scale_N, mean_N, variance_N, norms[0].epsilon)
 
     def _features(
-        self, x: Tensor, parameters: TaskParameters, training: bool, layers: list[Gradients] | None = None
+        self,
+        x: Tensor,
+        parameters: TaskParameters,
+        training: bool,
+        layers: list[Gradients] | None = None,
+        last: Form | None = None,
     ) -> Spikes:
-        """What the trunk sends to the streams. Each layer's backward is appended to ``layers``, if given."""
+        """What the trunk sends to the streams, in the form ``last`` if given.
+
+        Each layer's backward is appended to ``layers``, if given.
+        """
         spikes = Spikes(x, x.shape[-1])
-        for name, layer in self._trunk.items():
-            spikes, gradients = layer.fire(spikes, parameters.context[name], training)
+        for number, (name, layer) in enumerate(self._trunk.items(), start=1):
+            form = last if number == len(self._trunk) else None
+            spikes, gradients = layer.fire(spikes, parameters.context[name], training, form)
             if layers is not None:
                 layers.append(gradients)
         return spikes
@@ -231,8 +266,14 @@ class _Layer:
             weight_C, bias_C = (part.detach() for part in affine)
             self._currents = Currents(weight_C, bias_C, epsilon=self._normalization.epsilon)
 
-    def fire(self, x: Spikes, context: tuple[Tensor, ...], training: bool) -> tuple[Spikes, Gradients]:
-        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and the backward, to ``x`` and the parameters."""
+    def fire(
+        self, x: Spikes, context: tuple[Tensor, ...], training: bool, form: Form | None = None
+    ) -> tuple[Spikes, Gradients]:
+        """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and the backward, to ``x`` and the parameters.
+
+        ``form`` is that of the spikes; None takes the network's.
+        """
+        form = self._form if form is None else form
         neurons, normalization, currents = self._neurons, self._normalization, self._currents
         if normalization is None:
             (y,), of_products = connected([x], self.synapses)
@@ -243,7 +284,7 @@ class _Layer:
             if training:
                 mean_C, var_C = batch_moments(y_SRC, (mean_C, var_C), normalization.momentum)
             currents = currents._replace(mean_C=mean_C, variance_C=var_C)
-        values, currents_4C = neurons.fire(y_SRC, currents, self._form)
+        values, currents_4C = neurons.fire(y_SRC, currents, form)
 
         def gradients(grad: Tensor, of_inputs: bool) -> tuple[Tensor | None, list[Tensor]]:
             grad_TRC = grad.view(neurons.timesteps, *y_SRC.shape[1:])
@@ -252,7 +293,7 @@ class _Layer:
             return grad_x, parts if normalization is None else [*parts, *grad_2C]
 
         shape = (neurons.timesteps, *y.shape[1:-1], values.shape[-1])
-        return Spikes(values.view(shape), y.shape[-1], self._form == "bits"), gradients
+        return Spikes(values.view(shape), y.shape[-1], form == "bits"), gradients
 
 
 class _Decision(torch.autograd.Function):

@@ -85,7 +85,7 @@ def decide(
     device: torch.device,
     processes: int = 1,
 ) -> tuple[ExperimentConfig, tuple[str, ...]]:
-    """Replace ``auto`` in precision, engine and compression by what this machine can do.
+    """Replace ``auto`` in precision, engine, acting and compression by what this machine can do.
 
     A run that exists keeps what it began with, because precision and engine change roundings. Runs from before these
     settings existed began with float32 and the eager engine.
@@ -109,6 +109,7 @@ def decide(
     config = _with(config, precision=precision)
     engine, engine_notes = _engine(config, stored, device, processes)
     config = _with(config, engine=engine, replay_compression=_compression(config, stored, suite))
+    config = _with(config, acting=_acting(config, stored))
     return config, (*notes, *engine_notes)
 
 
@@ -156,6 +157,21 @@ def _engine(
             return name, [*notes, engine.note] if engine.note else notes
         notes.append(f"updates do not use the {name} engine: {reason}")
     raise ConfigError(f"learning.engine is 'auto', expected one engine that works: {'; '.join(notes)}")
+
+
+def _acting(config: ExperimentConfig, stored: ExperimentConfig | None) -> str:
+    """The engine if it acts; a run from before the setting existed began with eager."""
+    engine, asked = config.learning.engine, config.learning.acting
+    if asked == "auto" and stored is not None:
+        asked = "eager" if stored.learning.acting == "auto" else stored.learning.acting
+    if asked == "auto":
+        return engine if ENGINES[engine].acts else "eager"
+    if asked not in ("eager", engine):
+        raise ConfigError(
+            f"learning.acting is {asked!r}, expected eager, or native with learning.engine native, but the engine is "
+            f"{engine!r}; use learning.acting=eager or learning.engine={asked}"
+        )
+    return asked
 
 
 def _unavailable(engine: str, reason: str, begun: bool) -> ConfigError:

@@ -22,6 +22,7 @@ class Native(Engine):
     name = "native"
     needs = "a spiking network on a CPU and a C++ compiler (g++, or what CXX names)"
     note = "updates run natively, in C++ (learning.engine=eager does without)"
+    acts = True
 
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
         """Raises ConfigError for a network that the C++ code does not support, naming the setting or module."""
@@ -81,6 +82,11 @@ class Native(Engine):
         x, others = online.inputs(observations, generator), [x_next] if double_q else []
         q_BA, *choice = online.decide(x, online.for_task(task), training=True, other_inputs=others)
         return Values(q_BA, next_BA, *(choice or [next_BA]))
+
+    def decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
+        """See ``Engine.decisions``."""
+        online = self._online
+        return online.act(online.inputs(observations, generator), online.for_task(task))
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Adam in C++, which also writes the weights' rounded copies."""

@@ -56,6 +56,7 @@ class Engine(ABC):
 
     Attributes:
         name: its name in ``learning.engine``.
+        acts: whether it has ``decisions``, so that ``learning.acting`` can be its name.
         needs: what it needs, as in "expected ..." of an error message.
         note: what the user should know if ``auto`` takes it; empty for nothing.
         torchrun: whether several processes can divide its updates.
@@ -70,6 +71,7 @@ class Engine(ABC):
     needs: ClassVar[str]
     note: ClassVar[str] = ""
     torchrun: ClassVar[bool] = False
+    acts: ClassVar[bool] = False
 
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
         self.network, self.target, self.config = network, target, config
@@ -108,6 +110,10 @@ class Engine(ABC):
             task: index of the batch's task.
             generator: source of the encoding's random numbers.
         """
+
+    def decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
+        """Q-values ``[B, A]`` of raw observations ``[B, *shape]`` in eval mode, by which training acts."""
+        raise NotImplementedError(f"the {self.name} engine does not act")
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Adam over the parameters of ``network``."""

@@ -76,6 +76,22 @@ def test_a_stored_config_without_an_engine_means_eager() -> None:
     assert decided(small_config(total_steps=10_000_000), before_the_choice)[0].learning.engine == "eager"
 
 
+@pytest.mark.parametrize(("engine", "acting"), [("native", "native"), ("eager", "eager"), ("compiled", "eager")])
+def test_actions_come_from_the_engine_if_it_acts(engine: str, acting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ENGINES[engine], "unavailable", classmethod(lambda *_: None))
+    asked = small_config(learning={"engine": engine})
+    assert decided(asked)[0].learning.acting == acting
+    assert decided(asked, asked)[0].learning.acting == "eager"  # a run from before there was a choice
+    begun = small_config(learning={"engine": engine, "acting": acting})
+    assert decided(asked, begun)[0].learning.acting == acting
+    assert decided(small_config(learning={"engine": engine, "acting": "eager"}))[0].learning.acting == "eager"
+
+
+def test_native_acting_needs_the_native_engine() -> None:
+    with pytest.raises(ConfigError, match=r"learning\.acting is 'native', expected .* engine is 'eager'; use"):
+        decided(small_config(learning={"engine": "eager", "acting": "native"}))
+
+
 @compiles
 def test_auto_compiles_long_runs_only_and_says_so() -> None:
     short, no_notes = decided(small_config())

@@ -18,6 +18,7 @@ from switchmt_snn.config.yaml_io import load_config
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.machine.devices import has_bfloat16
+from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.updates import compiled
 from switchmt_snn.updates.engine import ENGINES
@@ -110,6 +111,44 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
 )
 def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
     _compare_to_rounding("native", network)
+
+
+@builds
+@pytest.mark.parametrize("copies", [1, 8, 40])  # 40: more lanes than a panel of few
+@pytest.mark.parametrize(
+    "network", [{}, OTHER_NEURONS, {"readout": "max_membrane"}, {"trunk": "nature"}, {"trunk": "mlp"}]
+)
+def test_native_decisions_are_the_eager_ones_to_rounding(network: dict[str, Any], copies: int) -> None:
+    """Also after an update has changed the weights."""
+    config = minatar(**{"threshold": 0.3, "stream_normalization": "batch", **network})
+    side = SIDES[config.network.trunk]
+    learning = replace(config.learning, engine="native", acting="native", precision="float32")
+    images = ObservationSpec((4, side, side), 1, 1.0, True, 6, 3)
+    learner = Learner(build_network(config.network, images, 1), learning, np.ones((3, 6), np.bool_), CPU, 0)
+    rng = np.random.default_rng(copies)
+    for _ in range(2):
+        x = torch.from_numpy((rng.random((copies, *images.shape)) < 0.4).astype(np.uint8))
+        with torch.inference_mode():
+            expected = learner.network.eval()(x, 1)
+            torch.testing.assert_close(
+                learner.engine.decisions(x, 1, learner.generator), expected, rtol=1e-3, atol=1e-4
+            )
+        assert np.array_equal(learner.act(x.numpy(), 1), expected.argmax(1).numpy())
+        many = [(rng.random((8, *images.shape)) < 0.4).astype(np.uint8) for _ in range(2)]
+        ones = np.ones(8, np.float32)
+        learner.update(Batch(many[0], rng.integers(0, 6, 8), ones, many[1], np.zeros(8, np.bool_), ones), 1)
+
+
+def test_acting_by_an_engine_that_does_not_act_is_refused() -> None:
+    config = minatar()
+    network = build_network(config.network, ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), 1)
+    learning = replace(config.learning, engine="eager", acting="native")
+    with pytest.raises(
+        ConfigError, match="learning.acting is 'native', expected .*engine is 'eager'; use .*acting=eager"
+    ):
+        Learner(network, learning, np.ones((3, 6), np.bool_), CPU, 0)
+    with pytest.raises(NotImplementedError, match="the eager engine does not act"):
+        ENGINES["eager"](network, network, learning).decisions(torch.zeros(1, 4, 10, 10), 0, torch.Generator())
 
 
 def _compare_to_rounding(engine: str, network: dict[str, Any]) -> None:
