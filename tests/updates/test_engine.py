@@ -144,7 +144,7 @@ def test_acting_by_an_engine_that_does_not_act_is_refused() -> None:
     network = build_network(config.network, ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3), 1)
     learning = replace(config.learning, engine="eager", acting="native")
     with pytest.raises(
-        ConfigError, match="learning.acting is 'native', expected .*engine is 'eager'; use .*acting=eager"
+        ConfigError, match=r"learning\.acting is 'native', expected .*engine is 'eager'; use .*acting=eager"
     ):
         Learner(network, learning, np.ones((3, 6), np.bool_), CPU, 0)
     with pytest.raises(NotImplementedError, match="the eager engine does not act"):
