@@ -79,8 +79,11 @@ class NetworkConfig:
     normalization: Literal["per_task", "shared"] = "per_task"
     """BatchNorm running statistics for each task, or one set for all (affine weights are always shared)."""
     stream_normalization: Literal["none", "batch"] = "none"
-    """BatchNorm of each stream's input currents before the dendritic gain, with weight and bias fixed at half the
-    threshold, so that fewer neurons are silent. It adds no parameter. none: the paper's network."""
+    """BatchNorm of each stream's input currents before the dendritic gain, with a fixed weight and bias
+    (stream_current_thresholds), so that fewer neurons are silent. It adds no parameter. none: the paper's network."""
+    stream_current_thresholds: float = 0.5
+    """With stream_normalization: mean and standard deviation of the normalized currents, in thresholds, before the gain
+    (0.5 on average at first). Few timesteps need more: a neuron fires if its current adds up to one threshold."""
     normalization_momentum: float = 0.1
     """BatchNorm momentum of the running statistics."""
     neuron_engine: Literal["fused", "snntorch"] = "fused"
@@ -96,6 +99,8 @@ class NetworkConfig:
         require(self.adaptation_strength >= 0.0, "network.adaptation_strength", self.adaptation_strength, "at least 0")
         require(0.0 <= self.readout_beta <= 1.0, "network.readout_beta", self.readout_beta, "a decay in [0, 1]")
         require(self.threshold > 0.0, "network.threshold", self.threshold, "above 0")
+        current = self.stream_current_thresholds
+        require(current > 0.0, "network.stream_current_thresholds", current, "above 0")
         require(0.0 < self.event_threshold < 1.0, "network.event_threshold", self.event_threshold, "within (0, 1)")
         require(self.dendritic_segments >= 1, "network.dendritic_segments", self.dendritic_segments, "at least 1")
         require(

@@ -47,6 +47,7 @@ _SETTINGS: dict[str, object] = {
     "k_winners": (None,),
     "normalization": ("per_task", "shared"),
     "stream_normalization": ("none", "batch"),
+    "stream_current_thresholds": _ANY,
     "normalization_momentum": _ANY,
     "neuron_engine": ("fused",),
 }

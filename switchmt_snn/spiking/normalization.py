@@ -83,6 +83,6 @@ def make_stream_normalization(config: NetworkConfig, num_neurons: int, num_tasks
     if config.stream_normalization == "none":
         return None
     if config.stream_normalization == "batch":
-        per_task, value = config.normalization == "per_task", config.threshold / 2
+        per_task, value = config.normalization == "per_task", config.threshold * config.stream_current_thresholds
         return FixedBatchNorm(num_neurons, num_tasks, per_task, config.normalization_momentum, value)
     raise ConfigError(f"network.stream_normalization is {config.stream_normalization!r}, expected none or batch")

@@ -38,7 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "ALIF subtract": {"neuron": "ALIF", "adaptation_strength": 0.5, "reset": "subtract"},
     "learned": {"neuron": "LIF", "learn_beta": True, "learn_threshold": True},
     "shared statistics": {"normalization": "shared"},
-    "stream normalization": {"stream_normalization": "batch"},
+    "stream normalization": {"stream_normalization": "batch", "stream_current_thresholds": 0.75},
     "mlp": {"trunk": "mlp"},
     "T 7": {"timesteps": 7},
     "T 1": {"timesteps": 1},

@@ -134,6 +134,7 @@ def test_normalized_streams_equal_eager(method: str, dendrites: str) -> None:
     """Q-values of training and of other inputs, gradients, and running statistics of the batch's task only."""
     spec = ObservationSpec((4, 10, 10), 1, 1.0, True, 6, 3)
     settings_ = {"method": method, "trunk": "minatar", "stream_normalization": "batch", "threshold": 0.4}
+    settings_["stream_current_thresholds"] = 0.6
     settings_ |= {} if method == "DSQN_D" else {"dendrites": dendrites}
     config = resolve(small_config(network=settings_)).network
     ours, theirs = build_network(config, spec, 1), build_network(config, spec, 1)

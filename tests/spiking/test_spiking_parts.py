@@ -66,12 +66,14 @@ def test_shared_statistics_serve_all_tasks() -> None:
     assert torch.equal(norm(x, 0), norm(x, 2))
 
 
-def test_normalized_streams_have_currents_around_half_the_threshold_and_no_more_parameters() -> None:
-    """Before the gain: mean and standard deviation are threshold / 2; the parameters are the paper's."""
+@pytest.mark.parametrize("thresholds", [0.5, 1.25])
+def test_normalized_streams_have_the_currents_asked_for_and_no_more_parameters(thresholds: float) -> None:
+    """Before the gain: mean and standard deviation are some thresholds; the parameters are the paper's."""
     spec = ObservationSpec((4, 84, 84), 4, 1 / 255, True, 18, 3)
     networks = {}
     for name in ("none", "batch"):
         settings = {"trunk": "nature", "hidden_units": 512, "threshold": 0.8, "stream_normalization": name}
+        settings["stream_current_thresholds"] = thresholds
         config = small_config(tasks={"suite": "atari", "names": ["pong", "breakout", "enduro"]}, network=settings)
         networks[name] = build_network(config.network, spec, 1)
     assert {trainable_parameters(network) for network in networks.values()} == {3_300_357}
@@ -79,9 +81,9 @@ def test_normalized_streams_have_currents_around_half_the_threshold_and_no_more_
     features = (torch.rand(2, 64, 3136, generator=torch.Generator().manual_seed(0)) < 0.15).float()
     gated = stream.current(features, stream.context(1), None, training=True).detach()
     current_RN = (gated / stream.dendrites(1).detach()).flatten(0, 1)
-    half = torch.full((512,), 0.4)
-    torch.testing.assert_close(current_RN.mean(0), half, rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(current_RN.std(0, unbiased=False), half, rtol=1e-3, atol=1e-3)
+    asked = torch.full((512,), 0.8 * thresholds)
+    torch.testing.assert_close(current_RN.mean(0), asked, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(current_RN.std(0, unbiased=False), asked, rtol=1e-3, atol=1e-3)
     plain = networks["none"].streams["advantage"]
     quiet = plain.current(features, plain.context(1), None, training=True)
     assert float((quiet > 0.8).float().mean()) < 0.001
