@@ -25,7 +25,8 @@ class LearningConfig:
     n_steps: int = 1
     """Rewards that a target adds up before the bootstrapped value (1: Eq. 2). A sum ends early with its episode."""
     double_q: bool = True
-    """Choose the next action with the online network and value it with the target network (Eq. 2)."""
+    """Choose the next action with the online network and value it with the target network (Eq. 2). false: the target
+    network chooses it, too, which saves the online network's pass over the next observations."""
     loss: Literal["mse", "huber"] = "mse"
     """Squared error (paper), or Huber with delta 1."""
     gradient_clip: Literal["none", "value", "norm"] = "none"
@@ -55,7 +56,9 @@ class LearningConfig:
     learning_starts_steps: int = 512
     """Transitions that a task must hold before it is sampled; until then its actions are random."""
     update_every_steps: int = 1
-    """Agent steps between two updates."""
+    """Agent steps between two rounds of updates."""
+    updates_per_round: int = 1
+    """Updates that a round makes one after the other; with update_tasks all, so many for every task."""
     overlap: bool = False
     """Step the environments on another thread while an update runs. Actions then come from the network before the
     current update instead of after it."""
@@ -63,6 +66,8 @@ class LearningConfig:
     """Sample the current task's buffer (paper), or make one update from every task's buffer in turn (script)."""
     target_update_every_steps: int = 10_000
     """Agent steps between two copies of the network into the target network."""
+    target_update_every_updates: int | None = None
+    """Count these copies in updates, over all tasks: a number takes the place of target_update_every_steps."""
     epsilon_start: float = 1.0
     """Exploration at the first step."""
     epsilon_end: float = 0.1
@@ -86,11 +91,13 @@ class LearningConfig:
             "n_steps",
             "replay_capacity_steps",
             "update_every_steps",
+            "updates_per_round",
             "target_update_every_steps",
+            "target_update_every_updates",
             "epsilon_decay_steps",
         ):
             value = getattr(self, name)
-            require(value >= 1, f"learning.{name}", value, "at least 1")
+            require(value is None or value >= 1, f"learning.{name}", value, "at least 1")
         require(
             self.batch_size <= self.replay_capacity_steps,
             "learning.batch_size",

@@ -93,7 +93,8 @@ class Training(Stateful):
         self.explore_rng = np.random.default_rng(seeds[1])
         self.sample_rng = np.random.default_rng(seeds[2])
         self.update_clock = Every(config.learning.update_every_steps)
-        self.target_clock = Every(config.learning.target_update_every_steps)
+        learning = config.learning
+        self.target_clock = Every(learning.target_update_every_updates or learning.target_update_every_steps)
         self.metrics_clock = Every(config.recording.metrics_every_steps)
         self.reproducible = True
         self._thread: ThreadPoolExecutor | None = None
@@ -118,8 +119,8 @@ class Training(Stateful):
                 played = self._store(actions, play.step(actions))  # observe r and s', store in D_i
                 self._learn()  # sample from D_i, gradient step
             yield from self._end_episodes(play, played, epsilon)  # terminal: H_i, Eq. 3, maybe i <- i + 1 mod |E|
-            for _ in range(self.target_clock.advance(self.num_envs)):
-                self.learner.copy_target()  # Q* <- Q
+            if self.config.learning.target_update_every_updates is None:
+                self._copy_target(passed=self.num_envs)
             if self.metrics_clock.advance(self.num_envs):
                 yield self.measure()
             yield Stepped(self.steps, task, epsilon, warming_up)
@@ -172,12 +173,19 @@ class Training(Stateful):
         """The updates that are due, from the current task's buffer or from every task's in turn."""
         learning = self.config.learning
         returns = Returns(learning.n_steps, learning.discount, learning.clip_rewards)
-        for _ in range(self.update_clock.advance(self.num_envs)):
+        for _ in range(self.update_clock.advance(self.num_envs) * learning.updates_per_round):
             tasks = [self.task] if learning.update_tasks == "current" else range(len(self.replays))
             for task in tasks:
                 if not self.is_warming_up(task):
                     batch = self.replays[task].sample(learning.batch_size, self.sample_rng, returns)
                     self.learner.update(batch, task)
+                    if learning.target_update_every_updates is not None:
+                        self._copy_target(passed=1)
+
+    def _copy_target(self, passed: int) -> None:
+        """Copy the target network if it is due, after so many more steps or updates."""
+        for _ in range(self.target_clock.advance(passed)):
+            self.learner.copy_target()  # Q* <- Q
 
     def _end_episodes(self, play: Play, played: VectorStep, epsilon: float) -> Iterator[Event]:
         """Report ended episodes, ask the policy, and start what comes next (Algorithm 1, lines 13-20)."""

@@ -66,7 +66,7 @@ def planned_updates(config: ExperimentConfig) -> int:
     """Updates that a run of a resolved config makes, warm-ups not subtracted."""
     learning = config.learning
     each = len(config.tasks.names) if learning.update_tasks == "all" else 1
-    return config.total_steps // learning.update_every_steps * each
+    return config.total_steps // learning.update_every_steps * learning.updates_per_round * each
 
 
 def compile_problem() -> str | None:

@@ -22,6 +22,7 @@ from switchmt_snn.learning.training import Training
 from switchmt_snn.replay.ring import Batch, FrameReplay
 from switchmt_snn.tasks.play import Play
 from tests.conftest import CountingEnvironment, SameObservationEnvironment, small_config, vector_suite
+from tests.learning.resuming import assert_continues_exactly
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "update_losses.json"
 
@@ -169,26 +170,7 @@ def test_every_attribute_is_saved_or_declared_derived() -> None:
 def test_state_dict_continues_exactly(policy: str) -> None:
     """At any step: a new Training with the state of an old one goes on bitwise the same."""
     config = small_config(switching={"policy": policy, "max_stay_steps": 45}, network={"encoding": "direct"})
-    whole = counting(config)
-    events, states = whole.events(), {}
-    log = []
-    for event in events:
-        log.append(event)
-        if isinstance(event, Stepped) and event.step in (3, 33, 150, 271):
-            frames = [{(s.lane, s.number): r.read_segment(s).copy() for s in r.segments()} for r in whole.replays]
-            import copy
-
-            states[event.step] = (copy.deepcopy(whole.state_dict()), frames, len(log))
-    for step, (state, frames, position) in states.items():
-        again = counting(config)
-        again.load_state_dict(state)
-        for replay, stored in zip(again.replays, frames, strict=True):
-            for segment in replay.segments():
-                replay.load_segment(segment, stored[segment.lane, segment.number])
-        assert again.reproducible
-        rest = run(again)
-        assert rest == log[position:], f"events differ after {step}"
-        assert torch.equal(again.learner.parameters(), whole.learner.parameters())
+    assert_continues_exactly(lambda: counting(config), at_steps=(3, 33, 150, 271))
 
 
 def contradiction(method: str, dendrites: str, seed: int) -> float:

@@ -100,8 +100,10 @@ def test_auto_compiles_long_runs_only_and_says_so() -> None:
     assert long.learning.engine == "compiled"
     assert len(notes) == 1
     assert "first" in notes[0]
-    every = {"update_every_steps": 4, "update_tasks": "all"}  # two tasks: one update per two steps
+    every: dict[str, Any] = {"update_every_steps": 4, "update_tasks": "all"}  # two tasks: one update per two steps
     assert compiled.planned_updates(small_config(total_steps=1000, learning=every)) == 500
+    every["updates_per_round"] = 3
+    assert compiled.planned_updates(small_config(total_steps=1000, learning=every)) == 1500
 
 
 def test_without_a_compiler_auto_says_so_and_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
