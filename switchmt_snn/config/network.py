@@ -78,6 +78,9 @@ class NetworkConfig:
     keeps all."""
     normalization: Literal["per_task", "shared"] = "per_task"
     """BatchNorm running statistics for each task, or one set for all (affine weights are always shared)."""
+    mlp_normalization: Literal["none", "batch"] = "none"
+    """BatchNorm of the mlp trunk's currents. Vector observations whose features are small against the threshold hardly
+    make a neuron fire without it. Trunks of images always have BatchNorm."""
     stream_normalization: Literal["none", "batch"] = "none"
     """BatchNorm of each stream's input currents before the dendritic gain, with a fixed weight and bias
     (stream_current_thresholds), so that fewer neurons are silent. It adds no parameter. none: the paper's network."""

@@ -275,12 +275,13 @@ class _Layer:
         """
         form = self._form if form is None else form
         neurons, normalization, currents = self._neurons, self._normalization, self._currents
-        if normalization is None:
-            (y,), of_products = connected([x], self.synapses)
-            y_SRC = y
-        else:
+        if self.synapses.stride:
             y, of_products = convolved(x, self.synapses)
-            y_SRC, (mean_C, var_C) = y.flatten(1, -2), context
+        else:
+            (y,), of_products = connected([x], self.synapses)
+        y_SRC = y.flatten(1, -2)
+        if normalization is not None:
+            mean_C, var_C = context
             if training:
                 mean_C, var_C = batch_moments(y_SRC, (mean_C, var_C), normalization.momentum)
             currents = currents._replace(mean_C=mean_C, variance_C=var_C)

@@ -46,6 +46,7 @@ _SETTINGS: dict[str, object] = {
     "dendritic_gating": ("max", "absolute_max"),
     "k_winners": (None,),
     "normalization": ("per_task", "shared"),
+    "mlp_normalization": ("none", "batch"),
     "stream_normalization": ("none", "batch"),
     "stream_current_thresholds": _ANY,
     "normalization_momentum": _ANY,
@@ -75,8 +76,8 @@ def unsupported_module(network: QNetwork) -> str | None:
         for part, module in modules.items():
             if not _TRUNK_PARTS[part](module):
                 return _named(f"trunk.{name}.{part}", module)
-        if _is_convolution(layer.synapses) != (layer.normalization is not None):
-            return f"trunk.{name}: a convolution without BatchNorm, or a linear layer with it"
+        if _is_convolution(layer.synapses) and layer.normalization is None:
+            return f"trunk.{name}: a convolution without BatchNorm"
     for name, stream in network.streams.items():
         if type(stream) is not Stream:
             return _named(f"streams.{name}", stream)

@@ -4,7 +4,7 @@ Shapes: T simulation steps, B batch, C channels, H W image, K tasks, A actions, 
 
     trunk  : nature   Conv 4->32 k8 s4 | Conv 32->64 k4 s2 | Conv 64->64 k3 s1, each with BatchNorm and neurons
              minatar  Conv c->16 k3 s1 with BatchNorm and neurons
-             mlp      Linear ->hidden with neurons (no normalisation)
+             mlp      Linear ->hidden with neurons (and BatchNorm if ``network.mlp_normalization`` says so)
     stream : Linear ->hidden, gain of the active dendrites, neurons, Linear ->outputs
     plain  : one stream with A outputs                       (paper, section 3.1)
     dueling: Q = V + A - mean_a(A), a stream for each
@@ -29,7 +29,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.dendrites import keep_k_winners, make_dendrites
 from switchmt_snn.spiking.encodings import make_encoding
 from switchmt_snn.spiking.neurons import NeuronLayer, NeuronState, make_neuron_layer
-from switchmt_snn.spiking.normalization import TaskBatchNorm, make_stream_normalization
+from switchmt_snn.spiking.normalization import TaskBatchNorm, make_mlp_normalization, make_stream_normalization
 from switchmt_snn.spiking.readout import make_readout
 from switchmt_snn.spiking.settings import require_known
 
@@ -184,7 +184,8 @@ class QNetwork(nn.Module):
             hidden = cast(int, config.hidden_units)
             # An image is flattened, so that the trunk takes any observation.
             synapses = nn.Sequential(nn.Flatten(1), nn.Linear(math.prod(shape), hidden))
-            self.trunk["linear1"] = TrunkLayer(synapses, None, make_neuron_layer(config, self.spiking))
+            normalization = make_mlp_normalization(config, hidden, observation.num_tasks)
+            self.trunk["linear1"] = TrunkLayer(synapses, normalization, make_neuron_layer(config, self.spiking))
             return (hidden,)
         if len(shape) != 3:
             raise ConfigError(

@@ -74,6 +74,19 @@ class FixedBatchNorm(TaskBatchNorm):
         self.register_buffer("bias", torch.full((num_channels,), value), persistent=False)
 
 
+def make_mlp_normalization(config: NetworkConfig, num_neurons: int, num_tasks: int) -> TaskBatchNorm | None:
+    """The normalization of the ``mlp`` trunk's currents that ``config.mlp_normalization`` names.
+
+    Raises:
+        ConfigError: unknown name.
+    """
+    if config.mlp_normalization == "none":
+        return None
+    if config.mlp_normalization == "batch":
+        return TaskBatchNorm(num_neurons, num_tasks, config.normalization == "per_task", config.normalization_momentum)
+    raise ConfigError(f"network.mlp_normalization is {config.mlp_normalization!r}, expected none or batch")
+
+
 def make_stream_normalization(config: NetworkConfig, num_neurons: int, num_tasks: int) -> FixedBatchNorm | None:
     """The normalization of a stream's currents that ``config.stream_normalization`` names.
 

@@ -40,6 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "shared statistics": {"normalization": "shared"},
     "stream normalization": {"stream_normalization": "batch", "stream_current_thresholds": 0.75},
     "mlp": {"trunk": "mlp"},
+    "mlp normalized": {"trunk": "mlp", "mlp_normalization": "batch"},
     "T 7": {"timesteps": 7},
     "T 1": {"timesteps": 1},
     "k winners": {"k_winners": 9},

@@ -19,7 +19,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.machine.devices import has_bfloat16
 from switchmt_snn.replay.ring import Batch
-from switchmt_snn.spiking.network import ObservationSpec, build_network
+from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
 from switchmt_snn.updates import compiled
 from switchmt_snn.updates.engine import ENGINES
 from tests.conftest import small_config
@@ -62,12 +62,16 @@ def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | No
     # Each gradient in units of its tensor's largest, which is what Adam makes of it; but biases before BatchNorm have
     # none except rounding.
     grads = {
-        name: p.grad
-        / (1.0 if "conv" in name and name.endswith("synapses.bias") else p.grad.abs().max().clamp(min=1e-9))
+        name: p.grad / (1.0 if _is_normalized_bias(network, name) else p.grad.abs().max().clamp(min=1e-9))
         for name, p in network.named_parameters()
         if p.grad is not None
     }
     return {**{k: v.detach() for k, v in values._asdict().items()}, **grads, **dict(network.named_buffers())}
+
+
+def _is_normalized_bias(network: QNetwork, name: str) -> bool:
+    layer, _, part = name.partition(".synapses.")
+    return part.endswith("bias") and network.get_submodule(layer).normalization is not None
 
 
 compiles = pytest.mark.skipif(compiled.compile_problem() is not None, reason="nothing can be compiled here")
@@ -105,9 +109,10 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
             "threshold": 0.2,
         },
         {"trunk": "mlp", "threshold": 0.2},
+        {"trunk": "mlp", "mlp_normalization": "batch", "stream_normalization": "batch"},
         {"trunk": "nature", "threshold": 0.5},
     ],
-    ids=["default", "LIF-subtract", "rate", "latency", "mlp", "nature"],
+    ids=["default", "LIF-subtract", "rate", "latency", "mlp", "mlp-normalized", "nature"],
 )
 def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
     _compare_to_rounding("native", network)
