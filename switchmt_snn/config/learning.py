@@ -45,6 +45,9 @@ class LearningConfig:
     its updates. Evaluation is always eager. auto: native with engine native, else eager."""
     clip_rewards: bool = True
     """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward."""
+    life_loss_is_terminal: bool = False
+    """Targets treat the loss of a life as terminal. The episode goes on, and returns and evaluation are as before.
+    Refused if no task has lives."""
     replay_capacity_steps: int = 1_048_576
     """Transitions kept per task."""
     replay_compression: Literal["auto", "zstd", "none"] = "auto"

@@ -30,6 +30,9 @@ class TasksConfig:
     """Atari: press FIRE once after a reset in games that wait for it (a greedy policy that never fires scores 0)."""
     full_action_space: bool = True
     """Atari: all 18 actions in every game, so that the tasks share one meaning per output."""
+    minimal_action_mask: bool = False
+    """Atari and MinAtar: all outputs stay, but a task takes only actions of its minimal set (Pong 6, Breakout 4,
+    Enduro 9) in training, targets, evaluation and exports. Refused with full_action_space=false."""
     max_episode_frames: int = 108_000
     """Atari and MinAtar: an episode is truncated after this many frames (in Atari 108,000 are 30 minutes of play)."""
 
@@ -41,6 +44,13 @@ class TasksConfig:
         require(self.num_envs >= 1, "tasks.num_envs", self.num_envs, "at least 1")
         require(self.frame_stack is None or self.frame_stack >= 1, "tasks.frame_stack", self.frame_stack, ">= 1")
         require(self.frame_skip >= 1, "tasks.frame_skip", self.frame_skip, "at least 1")
+        require(
+            self.full_action_space or not self.minimal_action_mask,
+            "tasks.minimal_action_mask",
+            self.minimal_action_mask,
+            "false with tasks.full_action_space=false, which has no other outputs to mask",
+            "choose one of the two",
+        )
         p = self.sticky_action_probability
         require(0.0 <= p < 1.0, "tasks.sticky_action_probability", p, "a probability in [0, 1)")
         require(self.noop_max >= 0, "tasks.noop_max", self.noop_max, "at least 0")

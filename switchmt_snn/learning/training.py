@@ -159,11 +159,11 @@ class Training(Stateful):
 
     def _store(self, actions: npt.NDArray[np.int64], played: VectorStep) -> VectorStep:
         """Store the transitions of a vector step in D_i, and count its steps."""
-        replay = self.replays[self.task]
+        replay, terminal = self.replays[self.task], played.terminated
+        if self.config.learning.life_loss_is_terminal and played.lives_lost is not None:
+            terminal = terminal | played.lives_lost  # for targets; the episode goes on
         for env in range(self.num_envs):
-            replay.add(
-                env, int(actions[env]), float(played.rewards[env]), bool(played.terminated[env]), played.frames[env]
-            )
+            replay.add(env, int(actions[env]), float(played.rewards[env]), bool(terminal[env]), played.frames[env])
         self.steps += self.num_envs
         self.steps_by_task[self.task] += self.num_envs
         self.steps_in_visit += self.num_envs

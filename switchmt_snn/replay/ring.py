@@ -156,7 +156,10 @@ class FrameReplay:
         self._write(lane, frame, age=0)
 
     def add(self, lane: int, action: int, reward: float, terminated: bool, next_frame: npt.NDArray[Any]) -> None:
-        """Add the transition from a lane's newest frame. At an episode's end, ``begin`` must follow."""
+        """Add the transition from a lane's newest frame. At an episode's end, ``begin`` must follow.
+
+        ``terminated`` is for targets: where an episode goes on after it (a life was lost), stacks go on, too.
+        """
         slot = self._slot(lane, self._written[lane] - 1)
         self._actions[slot] = action
         self._rewards[slot] = reward

@@ -24,7 +24,7 @@ from switchmt_snn.machine.devices import has_bfloat16, select_device
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.memory import MemoryEstimate, require_gpu_memory, require_memory
-from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.tasks.registry import make_suite, suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 from switchmt_snn.updates.engine import ENGINES
 
@@ -72,6 +72,7 @@ def plan(
         device = select_device(config.device)
     suite = make_suite(config.tasks)
     config, notes = decide(config, stored, suite, device, processes)
+    _require_lives(config)
     memory = describe_method(config, suite).memory
     require_memory(memory, config)
     require_gpu_memory(config, suite)
@@ -187,6 +188,14 @@ def _compression(config: ExperimentConfig, stored: ExperimentConfig | None, suit
     if config.learning.replay_compression == "auto" and stored is not None:
         config = _with(config, replay_compression=stored.learning.replay_compression)
     return "zstd" if compresses_replay(config, suite) else "none"
+
+
+def _require_lives(config: ExperimentConfig) -> None:
+    if config.learning.life_loss_is_terminal and not suite_of(config.tasks).tasks_with_lives:
+        raise ConfigError(
+            "learning.life_loss_is_terminal is True, expected false for tasks without lives "
+            f"({', '.join(config.tasks.names)})"
+        )
 
 
 def _require_divisible(config: ExperimentConfig, processes: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,26 +44,31 @@ class AtariCopies:
             use_fire_reset=config.fire_on_reset,
         )
         self._started = False
+        self._lives = np.zeros(num_envs, np.int32)
 
     def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
         """Start episodes: no-ops (number drawn from the seed) and FIRE happen inside."""
         order = np.argsort(env_ids)
         if len(env_ids) == self.num_envs:
-            observations, _ = self._env.reset(seed=seeds[order])
+            observations, info = self._env.reset(seed=seeds[order])
         else:
             if not self._started:
                 # The first reset of a vector environment must be whole; the others get a seed of no consequence.
                 self._env.reset(seed=np.zeros(self.num_envs, np.int64))
             mask = np.zeros(self.num_envs, np.bool_)
             mask[env_ids] = True
-            observations, _ = self._env.reset(seed=seeds[order], options={"reset_mask": mask})
+            observations, info = self._env.reset(seed=seeds[order], options={"reset_mask": mask})
         self._started = True
+        self._lives = np.array(info["lives"])  # of all copies
         return np.asarray(observations[env_ids], np.uint8)
 
     def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
         """Step all copies; a copy whose episode ended in the last step and was not reset returns a fresh start."""
-        observations, rewards, terminated, truncated, _ = self._env.step(actions)
-        return VectorStep(observations, rewards.astype(np.float64), terminated.copy(), truncated.copy())
+        observations, rewards, terminated, truncated, info = self._env.step(actions)
+        before, self._lives = self._lives, np.array(info["lives"])
+        return VectorStep(
+            observations, rewards.astype(np.float64), terminated.copy(), truncated.copy(), self._lives < before
+        )
 
     def close(self) -> None:
         """Free the emulators."""
@@ -78,6 +85,7 @@ class AtariSuite(Suite):
     frames_per_s = 60.0
     # Rainbow stays near random play in most games for this many steps (Kaiser et al. 2020, arXiv 1903.00374).
     steps_to_learn = 100_000
+    masks_actions = True
     references = ATARI_REFERENCES
     published = PUBLISHED_SCORES
 
@@ -92,10 +100,16 @@ class AtariSuite(Suite):
         return self.config.frame_skip
 
     @property
+    def tasks_with_lives(self) -> tuple[str, ...]:
+        """Games that begin with lives."""
+        return tuple(name for name in self.config.names if _facts(name).lives > 0)
+
+    @property
     def protocol(self) -> tuple[str, ...]:
-        """Sticky actions, how an episode starts, frame skip, and the longest episode."""
+        """Actions, sticky actions, how an episode starts, frame skip, and the longest episode."""
         config = self.config
         return (
+            "all 18 actions" if config.full_action_space and not config.minimal_action_mask else "minimal actions",
             f"sticky actions {config.sticky_action_probability:g}",
             f"fire on reset {'on' if config.fire_on_reset else 'off'}",
             f"no-ops <= {config.noop_max}",
@@ -128,7 +142,7 @@ class AtariSuite(Suite):
             scale=1.0 / 255.0,
             in_unit_range=True,
             action_names=action_names,
-            valid_actions_KA=np.ones((len(config.names), len(action_names)), np.bool_),
+            valid_actions_KA=_valid_actions(config, action_names),
             references={name: self.references[name] for name in config.names if name in self.references},
             make=make,
         )
@@ -138,18 +152,35 @@ def _action_names(config: TasksConfig) -> tuple[str, ...]:
     """One meaning per action: all 18, or the minimal set if the games agree on it."""
     if config.full_action_space:
         return tuple(action.name for action in Action.__members__.values())[:18]
-    counts = {name: _minimal_actions(name, config) for name in config.names}
+    counts = {name: _facts(name).minimal_actions for name in config.names}
     if len(set(counts.values())) > 1:
         shown = ", ".join(f"{name} {len(actions)}" for name, actions in counts.items())
         raise TaskError(
             f"tasks.full_action_space is false and the games' minimal action sets differ ({shown}), "
-            "expected one meaning per action; set tasks.full_action_space to true"
+            "expected one meaning per action; set tasks.full_action_space to true (and tasks.minimal_action_mask)"
         )
     return next(iter(counts.values()))
 
 
-def _minimal_actions(game: str, config: TasksConfig) -> tuple[str, ...]:
-    env = AtariVectorEnv(game, 1, full_action_space=False, use_fire_reset=config.fire_on_reset)
-    names = tuple(action.name for action in env.ale.get_action_set())
+def _valid_actions(config: TasksConfig, action_names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+    """``[K, A]``: every action, or those of each game's minimal set with ``minimal_action_mask``."""
+    if not config.minimal_action_mask:
+        return np.ones((len(config.names), len(action_names)), np.bool_)
+    return np.stack([np.isin(action_names, _facts(name).minimal_actions) for name in config.names])
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What a game says of itself when it is opened."""
+
+    minimal_actions: tuple[str, ...]
+    lives: int
+
+
+@functools.cache
+def _facts(game: str) -> _Facts:
+    env = AtariVectorEnv(game, 1, full_action_space=False)
+    _, info = env.reset(seed=0)
+    facts = _Facts(tuple(action.name for action in env.ale.get_action_set()), int(info["lives"][0]))
     env.close()
-    return names
+    return facts

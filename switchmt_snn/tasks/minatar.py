@@ -25,6 +25,7 @@ class MinAtarSuite(Suite):
     defaults = SUITE_DEFAULTS["minatar"]
     examples = ("breakout", "asterix")
     packages = ("minatar", "gymnasium")
+    masks_actions = True
 
     @classmethod
     def known_tasks(cls) -> tuple[str, ...]:
@@ -33,9 +34,14 @@ class MinAtarSuite(Suite):
 
     @property
     def protocol(self) -> tuple[str, ...]:
-        """Sticky actions and the longest episode."""
+        """Actions, sticky actions and the longest episode."""
         config = self.config
-        return (f"sticky actions {config.sticky_action_probability:g}", f"frame cap {config.max_episode_frames:,}")
+        actions = "minimal actions" if config.minimal_action_mask else "all 6 actions"
+        return (
+            actions,
+            f"sticky actions {config.sticky_action_probability:g}",
+            f"frame cap {config.max_episode_frames:,}",
+        )
 
     def make(self) -> TaskSuite:
         """Make the games.
@@ -44,8 +50,13 @@ class MinAtarSuite(Suite):
             MissingExtraError: MinAtar is not installed.
         """
         config = self.config
-        channels = max(int(_make_env(name, config).unwrapped.observation_space.shape[2]) for name in config.names)  # type: ignore[index]
+        games: list[Any] = [_make_env(name, config).unwrapped for name in config.names]
+        channels = max(int(game.observation_space.shape[2]) for game in games)
         frame_shape = (channels, SIDE_CELLS, SIDE_CELLS)
+        valid_actions_KA = np.ones((len(games), len(ACTION_NAMES)), np.bool_)
+        if config.minimal_action_mask:
+            every = np.arange(len(ACTION_NAMES))
+            valid_actions_KA = np.stack([np.isin(every, game.game.minimal_action_set()) for game in games])
 
         def make(task: int, num_envs: int) -> TaskEnvironment:
             envs = [_make_env(config.names[task], config) for _ in range(num_envs)]
@@ -59,7 +70,7 @@ class MinAtarSuite(Suite):
             scale=1.0,
             in_unit_range=True,
             action_names=ACTION_NAMES,
-            valid_actions_KA=np.ones((len(config.names), len(ACTION_NAMES)), np.bool_),
+            valid_actions_KA=valid_actions_KA,
             references={},
             make=make,
         )

@@ -64,7 +64,7 @@ def make_suite(config: TasksConfig) -> TaskSuite:
     """Make the tasks that a config names.
 
     Raises:
-        ConfigError: unknown suite.
+        ConfigError: unknown suite, or one that does not follow ``tasks.minimal_action_mask``.
         TaskError: a task is unknown, does not fit a Q-network, or is not what its suite says.
         MissingExtraError: the suite needs an optional package.
     """
@@ -73,6 +73,11 @@ def make_suite(config: TasksConfig) -> TaskSuite:
     for name in config.names:
         if name not in known and not suite.open_names:
             raise TaskError(f"tasks.names has the unknown {suite.name} task {name!r}{did_you_mean(name, known)}")
+    if config.minimal_action_mask and not suite.masks_actions:
+        raise ConfigError(
+            f"tasks.minimal_action_mask is True, expected false for the suite {config.suite!r}, which states no "
+            "minimal actions (masks_actions)"
+        )
     tasks = suite.make()
     stack, shape = resolved_frame_stack(config), tasks.valid_actions_KA.shape
     readable = all(name and name.isprintable() and not set(name) & set(',"') for name in tasks.names)

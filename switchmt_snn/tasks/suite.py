@@ -24,12 +24,18 @@ Frames = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class VectorStep:
-    """What one step of n environments returned; rewards are raw."""
+    """What one step of n environments returned; rewards are raw.
+
+    Attributes:
+        lives_lost: copies that lost a life in this step; None if the task has no lives. Only
+            ``learning.life_loss_is_terminal`` reads it.
+    """
 
     frames: Frames
     rewards: npt.NDArray[np.float64]
     terminated: npt.NDArray[np.bool_]
     truncated: npt.NDArray[np.bool_]
+    lives_lost: npt.NDArray[np.bool_] | None = None
 
     @property
     def ended(self) -> npt.NDArray[np.int64]:
@@ -151,6 +157,7 @@ class Suite:
         packages: distributions whose versions a run stores.
         frames_per_s: emulator frames per second of real time; None if the tasks have no clock.
         steps_to_learn: training for fewer agent steps teaches nothing, and a short run says so; None says nothing.
+        masks_actions: whether ``make`` follows ``tasks.minimal_action_mask``; else that setting is refused.
         references: random and human scores by task, for normalised scores.
         published: rows that are printed under an evaluation.
         config: the tasks that a config asks for.
@@ -163,6 +170,7 @@ class Suite:
     packages: ClassVar[tuple[str, ...]] = ()
     frames_per_s: ClassVar[float | None] = None
     steps_to_learn: ClassVar[int | None] = None
+    masks_actions: ClassVar[bool] = False
     references: ClassVar[dict[str, Reference]] = {}
     published: ClassVar[tuple[PublishedScores, ...]] = ()
 
@@ -192,6 +200,11 @@ class Suite:
     def decisions_per_s(self) -> float | None:
         """Agent steps per second of real time; None if the tasks have no clock."""
         return None if self.frames_per_s is None else self.frames_per_s / self.frame_skip
+
+    @property
+    def tasks_with_lives(self) -> tuple[str, ...]:
+        """Tasks of the config whose ``VectorStep`` names lost lives."""
+        return ()
 
     @property
     def protocol(self) -> tuple[str, ...]:

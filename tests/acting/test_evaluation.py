@@ -157,7 +157,7 @@ def test_a_protocol_lists_only_what_its_suite_knows() -> None:
     assert gym.environment == ()
     assert "sticky" not in str(gym)
     minatar = EvaluationProtocol.of(EvaluationConfig(), TasksConfig(suite="minatar", names=("breakout",)))
-    assert minatar.environment == ("sticky actions 0", "frame cap 108,000")
+    assert minatar.environment == ("all 6 actions", "sticky actions 0", "frame cap 108,000")
 
 
 def test_published_rows_are_the_papers() -> None:

@@ -88,7 +88,7 @@ def ring(
 
 
 def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator, operations: int) -> None:
-    """Random pushes, terminations, truncations and cuts, into both."""
+    """Random pushes, terminations, truncations, cuts, and terminal steps after which the episode goes on, into both."""
     shape = lanes[0].shape
     for lane_id, lane in enumerate(lanes):
         frame = rng.integers(0, 256, shape, np.uint8)
@@ -98,10 +98,10 @@ def drive(replay: FrameReplay, lanes: list[NaiveLane], rng: np.random.Generator,
         lane_id = int(rng.integers(len(lanes)))
         event = rng.random()
         frame = rng.integers(0, 256, shape, np.uint8)
-        action, reward, terminated = int(rng.integers(18)), float(rng.normal()), bool(event < 0.1)
+        action, reward, terminated = int(rng.integers(18)), float(rng.normal()), bool(event < 0.1 or event > 0.9)
         lanes[lane_id].add(action, reward, terminated, frame)
         replay.add(lane_id, action, reward, terminated, frame)
-        if event < 0.2:  # terminated or truncated, or the task was left
+        if event < 0.2:  # terminated or truncated, or the task was left; above 0.9 only a life was lost
             first = rng.integers(0, 256, shape, np.uint8)
             lanes[lane_id].begin(first)
             replay.begin(lane_id, first)

@@ -10,9 +10,9 @@ from ale_py.vector_env import AtariVectorEnv
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from switchmt_snn.config import TasksConfig
-from switchmt_snn.errors import TaskError
+from switchmt_snn.errors import ConfigError, TaskError
 from switchmt_snn.tasks.play import Play, episode_seed
-from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.tasks.registry import make_suite, suite_of
 from tests.conftest import CountingEnvironment, vector_suite
 
 gymnasium.register_envs(ale_py)
@@ -21,7 +21,7 @@ gymnasium.register_envs(ale_py)
 @pytest.mark.slow
 @pytest.mark.parametrize(("game", "name"), [("pong", "Pong"), ("breakout", "Breakout"), ("enduro", "Enduro")])
 def test_atari_equals_gymnasium_with_the_standard_wrappers(game: str, name: str) -> None:
-    """Same actions: equal stacks, rewards and terminations, episode for episode.
+    """Same actions: equal stacks, rewards, terminations and lost lives, episode for episode.
 
     Without no-ops and FIRE, whose random numbers the two draw differently.
     """
@@ -31,7 +31,7 @@ def test_atari_equals_gymnasium_with_the_standard_wrappers(game: str, name: str)
     single = FrameStackObservation(AtariPreprocessing(single, noop_max=0), 4, padding_type="zero")
     play.begin(np.asarray([0]), np.asarray([3]))
     expected, _ = single.reset(seed=3)
-    rng, rewards, ended = np.random.default_rng(1), 0, 0
+    rng, rewards, ended, lost, lives = np.random.default_rng(1), 0, 0, 0, single.unwrapped.ale.lives()
     for _ in range(700):
         assert np.array_equal(play.observations[0], expected)
         action = int(rng.integers(18))
@@ -39,11 +39,17 @@ def test_atari_equals_gymnasium_with_the_standard_wrappers(game: str, name: str)
         expected, reward, terminated, truncated, _ = single.step(action)
         assert played.rewards[0] == reward
         assert (played.terminated[0], played.truncated[0]) == (terminated, truncated)
+        fallen, lives = single.unwrapped.ale.lives() < lives, single.unwrapped.ale.lives()
+        assert played.lives_lost is not None
+        assert played.lives_lost[0] == fallen
+        lost += fallen
         rewards += reward != 0
         if terminated or truncated:
             ended += 1
             play.begin(np.asarray([0]), np.asarray([3]))
             expected, _ = single.reset(seed=3)
+            lives = single.unwrapped.ale.lives()
+    assert lost == (5 * ended + 5 - lives if game == "breakout" else 0)
     assert rewards or game == "enduro"
     assert ended or game != "breakout"
     play.close()
@@ -185,3 +191,38 @@ def test_an_environment_that_does_not_repeat_itself_is_noticed() -> None:
     play.begin(np.asarray([0]), np.asarray([1]))
     play.step(np.asarray([0]))
     assert not Play(suite, 0, 1).load_state_dict(play.state_dict())
+
+
+def test_the_minimal_action_mask_keeps_all_outputs_and_their_meaning() -> None:
+    suite = make_suite(TasksConfig(minimal_action_mask=True))
+    assert suite.num_actions == 18
+    assert suite.action_names == make_suite(TasksConfig()).action_names
+    valid = {
+        name: [suite.action_names[a] for a in np.flatnonzero(suite.valid_actions_KA[k])]
+        for k, name in enumerate(suite.names)
+    }
+    assert valid["pong"] == ["NOOP", "FIRE", "RIGHT", "LEFT", "RIGHTFIRE", "LEFTFIRE"]
+    assert valid["breakout"] == ["NOOP", "FIRE", "RIGHT", "LEFT"]
+    assert len(valid["enduro"]) == 9
+    minatar = make_suite(TasksConfig(suite="minatar", names=("breakout", "freeway"), minimal_action_mask=True))
+    assert [np.flatnonzero(row).tolist() for row in minatar.valid_actions_KA] == [[0, 1, 3], [0, 2, 4]]
+
+
+@pytest.mark.parametrize("suite_name", ["atari", "minatar"])
+def test_the_protocol_says_which_actions_a_score_had(suite_name: str) -> None:
+    names = ("breakout",)
+    (masked, *_), (full, *_) = (
+        suite_of(TasksConfig(suite=suite_name, names=names, minimal_action_mask=mask)).protocol
+        for mask in (True, False)
+    )
+    assert masked == "minimal actions"
+    assert full in ("all 18 actions", "all 6 actions")
+
+
+def test_a_mask_that_would_hide_nothing_is_refused_by_name() -> None:
+    with pytest.raises(
+        ConfigError, match=r"tasks\.minimal_action_mask is True, expected false with .*full_action_space"
+    ):
+        TasksConfig(minimal_action_mask=True, full_action_space=False)
+    with pytest.raises(ConfigError, match=r"tasks\.minimal_action_mask is True, expected false for the suite 'gym'"):
+        make_suite(TasksConfig(suite="gym", names=("CartPole-v1",), minimal_action_mask=True))
