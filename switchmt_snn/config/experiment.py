@@ -48,6 +48,12 @@ class ExperimentConfig:
         require(self.seed >= 0, "seed", self.seed, "at least 0")
         require(self.total_steps >= 1, "total_steps", self.total_steps, "at least 1")
         require(self.threads is None or self.threads >= 1, "threads", self.threads, "at least 1 or null")
+        require(
+            self.network.quantiles == 1 or self.learning.loss == "huber",
+            "learning.loss",
+            self.learning.loss,
+            f"huber with network.quantiles={self.network.quantiles}",
+        )
         stack = resolved_frame_stack(self.tasks)
         per_env = self.learning.replay_capacity_steps // self.tasks.num_envs
         require(

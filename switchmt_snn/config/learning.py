@@ -28,7 +28,8 @@ class LearningConfig:
     """Choose the next action with the online network and value it with the target network (Eq. 2). false: the target
     network chooses it, too, which saves the online network's pass over the next observations."""
     loss: Literal["mse", "huber"] = "mse"
-    """Squared error (paper), or Huber with delta 1."""
+    """Squared error (paper), or Huber with delta 1. With network.quantiles above 1, huber is the quantile Huber loss
+    (kappa 1), and mse is refused."""
     gradient_clip: Literal["none", "value", "norm"] = "none"
     """Clamp each gradient element, or scale the whole gradient to a largest norm."""
     gradient_clip_at: float = 1.0

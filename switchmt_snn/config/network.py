@@ -34,6 +34,9 @@ class NetworkConfig:
     """Q from the head's output over time: its mean, or the last or largest membrane of a non-spiking integrator."""
     readout_beta: float = 1.0
     """Decay per step of the non-spiking integrator that the two membrane readouts use."""
+    quantiles: int = 1
+    """Quantiles of the return that training learns per action; Q is their mean (QR-DQN, Dabney et al. 2018). Above 1,
+    learning.loss must be huber. Exports hold the mean's weights. 1 learns Q itself (paper)."""
     neuron: Literal["IF", "LIF", "Synaptic", "ALIF"] | PluginName = "IF"
     """IF, LIF (IF with the decay `beta`), Synaptic (LIF fed by a decaying current), ALIF (LIF whose threshold rises
     with its spikes), or a class from outside the package, package.module:Class (docs/algorithm.md, Neurons)."""
@@ -101,6 +104,14 @@ class NetworkConfig:
             require(0.0 <= getattr(self, key) <= 1.0, f"network.{key}", getattr(self, key), "a decay in [0, 1]")
         require(self.adaptation_strength >= 0.0, "network.adaptation_strength", self.adaptation_strength, "at least 0")
         require(0.0 <= self.readout_beta <= 1.0, "network.readout_beta", self.readout_beta, "a decay in [0, 1]")
+        require(self.quantiles >= 1, "network.quantiles", self.quantiles, "at least 1")
+        require(
+            self.quantiles == 1 or self.readout != "max_membrane",
+            "network.readout",
+            self.readout,
+            f"mean or last_membrane with network.quantiles={self.quantiles}",
+            "the mean over quantiles of largest membranes is not linear in the head",
+        )
         require(self.threshold > 0.0, "network.threshold", self.threshold, "above 0")
         current = self.stream_current_thresholds
         require(current > 0.0, "network.stream_current_thresholds", current, "above 0")

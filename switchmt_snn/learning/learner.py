@@ -1,6 +1,6 @@
 """The learner: double-DQN target, loss, Adam, target network (paper, Eq. 2; Algorithm 1, lines 10-12 and 21-22).
 
-Shapes: B batch, A actions, K tasks.
+Shapes: B batch, A actions, M quantiles, K tasks.
 """
 
 from __future__ import annotations
@@ -26,28 +26,59 @@ from switchmt_snn.updates.engine import engine_class
 from switchmt_snn.updates.protocol import DeviceBatch, EngineFactory
 
 
+def of_actions(values: Tensor, actions_B: Tensor) -> Tensor:
+    """Values ``[B]`` or ``[B, M]`` of one action each, of values ``[B, A]`` or ``[B, M, A]``."""
+    return values.take_along_dim(_below(actions_B, values), dim=-1).squeeze(-1)
+
+
+def _below(values_B: Tensor, like: Tensor) -> Tensor:
+    """Values ``[B]`` with as many dimensions as ``like``, whose first one is B."""
+    return values_B.view(-1, *(1,) * (like.dim() - 1))
+
+
 def td_target(
-    rewards_B: Tensor, terminated_B: Tensor, q_next_BA: Tensor, q_choice_BA: Tensor, discounts_B: Tensor
+    rewards_B: Tensor, terminated_B: Tensor, next_values: Tensor, q_choice_BA: Tensor, discounts_B: Tensor
 ) -> Tensor:
     """Eq. 2: ``y_n = r_n`` if the next state is terminal, else ``r_n + gamma Q*(s', argmax_a Q(s', a))``.
 
     For transitions of n steps, ``r_n`` is the discounted sum of their rewards, ``s'`` the state after them, and
-    ``gamma^n`` stands for gamma.
+    ``gamma^n`` stands for gamma. Of quantiles, each one of the chosen action gives a target.
 
     Args:
         rewards_B: rewards r_n.
         terminated_B: whether the next state is terminal. A truncated episode's next state is not.
-        q_next_BA: target network's values Q* of the next states.
+        next_values: target network's values of the next states, ``[B, A]`` or ``[B, M, A]``.
         q_choice_BA: values that choose the action; -inf where an action does not exist.
         discounts_B: gamma, or gamma^n.
+
+    Returns:
+        ``[B]``, or ``[B, M]``.
     """
-    action_B1 = q_choice_BA.argmax(dim=1, keepdim=True)
-    value_B = q_next_BA.gather(1, action_B1).squeeze(1)
-    return rewards_B + discounts_B * value_B.masked_fill(terminated_B, 0.0)
+    values = of_actions(next_values, q_choice_BA.argmax(dim=1))
+    rewards, terminated, discounts = (_below(part, values) for part in (rewards_B, terminated_B, discounts_B))
+    return rewards + discounts * values.masked_fill(terminated, 0.0)
+
+
+def quantile_huber_loss(values_BM: Tensor, targets_BM: Tensor) -> Tensor:
+    """QR-DQN's loss (Dabney et al. 2018, arXiv 1710.10044, Eq. 10) with kappa 1.
+
+    ``|tau_i - 1{y_j < z_i}| Huber(y_j - z_i)`` with ``tau_i = (2i - 1) / (2M)``: the sum over the predicted quantiles
+    z_i, the mean over the targets y_j and over the batch, as in Dopamine.
+    """
+    values_BM1, targets_B1M = values_BM[:, :, None], targets_BM[:, None, :]
+    quantiles = values_BM.shape[1]
+    tau_M1 = (torch.arange(quantiles, device=values_BM.device, dtype=values_BM.dtype)[:, None] + 0.5) / quantiles
+    weights_BMM = (tau_M1 - (targets_B1M < values_BM1).to(values_BM.dtype)).abs()
+    values_BMM, targets_BMM = torch.broadcast_tensors(values_BM1, targets_B1M)
+    errors_BMM = F.huber_loss(values_BMM, targets_BMM, reduction="none")
+    return (weights_BMM * errors_BMM).sum(dim=1).mean()
 
 
 LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"mse": F.mse_loss, "huber": F.huber_loss}
 """Of Q(s, a) and target, by the name in ``learning.loss``."""
+
+QUANTILE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"huber": quantile_huber_loss}
+"""Of the quantiles of (s, a) and their targets, likewise."""
 
 CLIPS: dict[str, Callable[[list[Parameter], float], object]] = {
     "none": lambda parameters, bound: None,
@@ -113,7 +144,7 @@ class Learner(Stateful):
         """
         self.config = config
         self.device = device
-        self._loss = _named(LOSSES, "learning.loss", config.loss)
+        self._loss = _loss_of(config.loss, network.config.quantiles)
         self._clip = _named(CLIPS, "learning.gradient_clip", config.gradient_clip)
         self.network = network.to(device)
         self.target = copy.deepcopy(self.network).requires_grad_(False).eval()
@@ -170,9 +201,9 @@ class Learner(Stateful):
         values = self.engine.values(batch.observations, batch.next_observations, task, self.generator)
         with torch.no_grad():
             q_choice_BA = values.choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
-            target_B = td_target(batch.rewards_B, batch.terminated_B, values.next_BA, q_choice_BA, batch.discounts_B)
-        q_B = values.q_BA.gather(1, batch.actions_B[:, None]).squeeze(1)
-        loss = self._loss(q_B, target_B)
+            targets = td_target(batch.rewards_B, batch.terminated_B, values.target, q_choice_BA, batch.discounts_B)
+        predicted = of_actions(values.online, batch.actions_B)
+        loss = self._loss(predicted, targets)
         for parameter in self._trained:
             parameter.grad = None
         loss.backward()
@@ -180,7 +211,7 @@ class Learner(Stateful):
         self.optimizer.step()
         with torch.no_grad():
             self.loss_sum += self.engine.over_processes(loss.detach())
-            self.q_sum += self.engine.over_processes(q_B.mean())
+            self.q_sum += self.engine.over_processes(predicted.mean())
 
     def copy_target(self) -> None:
         """Q* <- Q, running statistics included."""
@@ -235,6 +266,12 @@ class Learner(Stateful):
 
     def _tensor(self, array: npt.NDArray[np.generic] | Tensor) -> Tensor:
         return array if isinstance(array, Tensor) else to_device(array, self.device)
+
+
+def _loss_of(name: str, quantiles: int) -> Callable[[Tensor, Tensor], Tensor]:
+    if quantiles == 1:
+        return _named(LOSSES, "learning.loss", name)
+    return _named(QUANTILE_LOSSES, f"with network.quantiles={quantiles}, learning.loss", name)
 
 
 _T = TypeVar("_T")

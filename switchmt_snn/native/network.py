@@ -5,7 +5,7 @@ are innermost in memory. For autograd, everything from the encoded inputs to the
 ``native/README.md`` draws both directions side by side.
 
 Shapes: S steps of an input (T, or 1 that all steps share), T simulation steps, B batch, R rows, C channels, N neurons
-of all streams, A actions.
+of all streams, A actions, M quantiles, O outputs of the heads (one per quantile and action).
 """
 
 from __future__ import annotations
@@ -135,29 +135,34 @@ class NativeNetwork:
             (y_TBN,), _ = connected([features], self._streams)
             currents = self._stream_currents(y_TBN, parameters, training=False)
             spikes_SBN, _ = self._neurons.fire(y_TBN, currents, self._last_form)
-            output_SBA = self._heads.outputs(spikes_SBN)
-        return self._q_values(output_SBA[0] if self._is_mean else output_SBA)
+            output_SBA = self._heads.means(spikes_SBN)
+        return self._over_steps(output_SBA[0] if self._is_mean else output_SBA)
 
     def decide(
         self, x: Tensor, parameters: TaskParameters, training: bool, other_inputs: Sequence[Tensor] = ()
     ) -> list[Tensor]:
-        """Q-values ``[B, A]`` of several inputs at once, which shares products with the streams' weights.
+        """Values of several inputs at once, which shares products with the streams' weights.
 
         Args:
-            x: of ``inputs``; normalized by the batch if ``training``, and then its Q-values have a gradient.
+            x: of ``inputs``; normalized by the batch if ``training``, and then its values have a gradient.
             parameters: of ``for_task``.
             training: see ``x``.
             other_inputs: of ``inputs``; normalized by the running statistics, their Q-values have no gradient.
+
+        Returns:
+            ``[B, A]``, or ``[B, M, A]`` with several quantiles, for ``x``; Q-values ``[B, A]`` for each other input.
         """
         if training and torch.is_grad_enabled():
             outputs = _Decision.apply(self, x, parameters, other_inputs, *self._differentiated)  # type: ignore[no-untyped-call]
         else:
             with torch.no_grad():
                 outputs, _ = self._outputs(x, parameters, training, other_inputs, None)
-        return [self._q_values(output) for output in outputs]
+        values, *others = (self._over_steps(output) for output in outputs)
+        quantiles = self._network.config.quantiles
+        return [values if quantiles == 1 else values.unflatten(-1, (quantiles, -1)), *others]
 
-    def _q_values(self, output: Tensor) -> Tensor:
-        """``[B, A]`` of a head's output ``[B, A]`` (``mean`` readout) or ``[T, B, A]``."""
+    def _over_steps(self, output: Tensor) -> Tensor:
+        """``[B, O]`` of a head's output ``[B, O]`` (``mean`` readout) or ``[T, B, O]``."""
         if self._is_mean:
             return output
         readout = self._network.readout
@@ -171,7 +176,9 @@ class NativeNetwork:
         other_inputs: Sequence[Tensor],
         layers: list[Gradients] | None,
     ) -> tuple[list[Tensor], Backward]:
-        """Outputs of the heads, ``[B, A]`` (``mean`` readout) or ``[T, B, A]``, and the backward of the first ones.
+        """Outputs of the heads, ``[B, O]`` (``mean`` readout) or ``[T, B, O]``, and the backward of the first ones.
+
+        Those of other inputs are means over quantiles.
 
         Each trunk layer's backward is appended to ``layers``, which the returned function empties from the end.
         """
@@ -182,9 +189,10 @@ class NativeNetwork:
         currents = [self._stream_currents(y_TBN, parameters, training=False) for y_TBN in ys[1:]]
         currents = [self._stream_currents(ys[0], parameters, training), *currents]
         fired = [self._neurons.fire(y, current, self._last_form) for y, current in zip(ys, currents, strict=True)]
-        outputs = [self._heads.outputs(spikes_SBN) for spikes_SBN, _ in fired]
         # The backward keeps only the first input's activations alive, and not its own outputs.
-        y_TBN, (spikes_SBN, currents_4N), shape = ys[0], fired[0], outputs[0].shape
+        y_TBN, (spikes_SBN, currents_4N) = ys[0], fired[0]
+        outputs = [self._heads.outputs(spikes_SBN), *(self._heads.means(other_SBN) for other_SBN, _ in fired[1:])]
+        shape = outputs[0].shape
         task, version = parameters.task, self._version
 
         def backward(grad: Tensor) -> list[Tensor]:
@@ -192,9 +200,9 @@ class NativeNetwork:
                 raise RuntimeError("a second backward, expected one for each decision")
             if self._version_now() != version:
                 raise RuntimeError("parameters have changed since the decision, expected its backward first")
-            steps, grad_SBA = self._neurons.timesteps, grad.contiguous().view(shape)
+            steps, grad_SBO = self._neurons.timesteps, grad.contiguous().view(shape)
             scale = 1.0 / steps if self._is_mean else 1.0
-            grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBA, scale)
+            grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBO, scale)
             grad_TBN = grad_SBN.expand(steps, -1, -1)
             grad_y, (grad_gain_N, grad_shift_N) = self._neurons.fire_backward(y_TBN, currents_4N, grad_TBN)
             if self._stream_norms:  # the gain scales the normalized current, and its constant shift
@@ -208,7 +216,7 @@ class NativeNetwork:
                 parts = [*of_layer, *parts]
             return parts
 
-        return [output_SBA[0] if self._is_mean else output_SBA for output_SBA in outputs], backward
+        return [output_SBO[0] if self._is_mean else output_SBO for output_SBO in outputs], backward
 
     def _stream_currents(self, y_TBN: Tensor, parameters: TaskParameters, training: bool) -> Currents:
         """How the streams' currents come from their products: the gain, of the normalized product if that is set."""

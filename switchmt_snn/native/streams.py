@@ -2,7 +2,8 @@
 
 They are few multiplications, but PyTorch takes some fifty single operations for them.
 
-Shapes: S steps of the spikes (T, or 1 for their mean), B batch, N neurons of all streams, A actions.
+Shapes: S steps of the spikes (T, or 1 for their mean), B batch, N neurons of all streams, A actions, M quantiles,
+O outputs: one per quantile and action, the actions of a quantile side by side.
 """
 
 from __future__ import annotations
@@ -96,6 +97,8 @@ class _Head(ctypes.Structure):
 class Heads:
     """The heads of all streams and the combination of their outputs, which is linear, as one matrix.
 
+    With quantiles, there is a second one of their means.
+
     Attributes:
         parameters: weight and bias of each head.
     """
@@ -104,16 +107,19 @@ class Heads:
         """Reads no parameter yet; see ``read``."""
         layers = {name: cast(Stream, stream).head for name, stream in network.streams.items()}
         self.parameters = tuple(part for layer in layers.values() for part in (layer.weight, layer.bias))
-        outputs = [layer.out_features for layer in layers.values()]
+        self._quantiles = network.config.quantiles
+        outputs = [layer.out_features // self._quantiles for layer in layers.values()]
         units = torch.eye(sum(outputs)).split(outputs, dim=-1)
-        combination_OA = network.combine(dict(zip(layers, units, strict=True))).contiguous()
-        self._combinations = combination_OA.split(outputs)  # what a head's outputs add to Q
-        neurons, actions = sum(layer.in_features for layer in layers.values()), combination_OA.shape[1]
-        self._weight_AN, self._bias_A = torch.empty(actions, neurons), torch.empty(actions)
+        combination = network.combine(dict(zip(layers, units, strict=True))).contiguous()
+        self._combinations = combination.split(outputs)  # what a head's outputs of a quantile add to Q, [outputs, A]
+        neurons, actions = sum(layer.in_features for layer in layers.values()), combination.shape[1]
+        self._weight_ON = torch.empty(self._quantiles * actions, neurons)
+        self._bias_O = torch.empty(self._quantiles * actions)
+        self._mean = self._weight_ON, self._bias_O
         self._heads = (_Head * len(layers))()
         for head, layer, combination in zip(self._heads, layers.values(), self._combinations, strict=True):
             head.combination = combination.data_ptr()
-            head.inputs, head.outputs = layer.in_features, layer.out_features
+            head.inputs, head.outputs = layer.in_features, len(combination)
 
     def read(self) -> None:
         """Make the matrix from the parameters as they are now.
@@ -121,41 +127,58 @@ class Heads:
         Raises:
             ValueError: they are not contiguous float32.
         """
-        actions, neurons = self._weight_AN.shape
+        outputs, neurons = self._weight_ON.shape
+        quantiles, actions = self._quantiles, outputs // self._quantiles
         for head, weight, bias in zip(self._heads, self.parameters[::2], self.parameters[1::2], strict=True):
-            head.weight = pointer(weight, FLOAT32, (head.outputs, head.inputs))
-            head.bias = pointer(bias, FLOAT32, (head.outputs,))
-        combined = self._weight_AN.data_ptr(), self._bias_A.data_ptr()
-        library().snn_combine_heads(ctypes.addressof(self._heads), len(self._heads), *combined, neurons, actions)
+            head.weight = pointer(weight, FLOAT32, (quantiles * head.outputs, head.inputs))
+            head.bias = pointer(bias, FLOAT32, (quantiles * head.outputs,))
+        heads = ctypes.addressof(self._heads), len(self._heads)
+        combined = self._weight_ON.data_ptr(), self._bias_O.data_ptr()
+        library().snn_combine_heads(*heads, *combined, neurons, quantiles, actions)
+        if quantiles > 1:
+            shape = quantiles, actions
+            self._mean = self._weight_ON.unflatten(0, shape).mean(0), self._bias_O.unflatten(0, shape).mean(0)
 
     def outputs(self, spikes_SBN: Tensor) -> Tensor:
-        """``[S, B, A]`` for float32 spikes: Q-values, if the heads are all that follows.
+        """``[S, B, O]`` for float32 spikes: values of all quantiles, if the heads are all that follows.
 
         Raises:
             ValueError: spikes are not contiguous float32 of all neurons.
         """
-        steps, batch, _ = spikes_SBN.shape
-        actions, neurons = self._weight_AN.shape
-        q_SBA = torch.empty(steps, batch, actions)
-        spikes = pointer(spikes_SBN, FLOAT32, (None, None, neurons))
-        pointers = spikes, self._weight_AN.data_ptr(), self._bias_A.data_ptr(), q_SBA.data_ptr()
-        library().snn_read_out(*pointers, steps * batch, neurons, actions, torch.get_num_threads())
-        return q_SBA
+        return _read_out(spikes_SBN, self._weight_ON, self._bias_O)
 
-    def gradients(self, spikes_SBN: Tensor, grad_SBA: Tensor, scale: float) -> tuple[Tensor, list[Tensor]]:
-        """Gradients of the spikes, times a scale, and of ``parameters``.
+    def means(self, spikes_SBN: Tensor) -> Tensor:
+        """``[S, B, A]``: as ``outputs``, the means over the quantiles.
 
         Raises:
-            ValueError: spikes or gradient are not contiguous float32 of all neurons or actions.
+            ValueError: spikes are not contiguous float32 of all neurons.
         """
-        (actions, neurons), rows = self._weight_AN.shape, spikes_SBN.shape[0] * spikes_SBN.shape[1]
+        return _read_out(spikes_SBN, *self._mean)
+
+    def gradients(self, spikes_SBN: Tensor, grad_SBO: Tensor, scale: float) -> tuple[Tensor, list[Tensor]]:
+        """Gradients of the spikes, times a scale, and of ``parameters``, from that of ``outputs``.
+
+        Raises:
+            ValueError: spikes or gradient are not contiguous float32 of all neurons or outputs.
+        """
+        (outputs, neurons), rows = self._weight_ON.shape, spikes_SBN.shape[0] * spikes_SBN.shape[1]
         grad_spikes, gradients = torch.empty_like(spikes_SBN), [torch.empty_like(part) for part in self.parameters]
         for head, weight, bias in zip(self._heads, gradients[::2], gradients[1::2], strict=True):
             head.grad_weight, head.grad_bias = weight.data_ptr(), bias.data_ptr()
         spikes = pointer(spikes_SBN, FLOAT32, (None, None, neurons))
-        grad = pointer(grad_SBA, FLOAT32, (*spikes_SBN.shape[:2], actions))
-        sizes = (rows, neurons, actions, torch.get_num_threads())
+        grad = pointer(grad_SBO, FLOAT32, (*spikes_SBN.shape[:2], outputs))
+        sizes = (rows, neurons, self._quantiles, outputs // self._quantiles, torch.get_num_threads())
         heads = ctypes.addressof(self._heads), len(self._heads)
-        pointers = self._weight_AN.data_ptr(), spikes, grad
+        pointers = self._weight_ON.data_ptr(), spikes, grad
         library().snn_heads_backward(*heads, *pointers, scale, grad_spikes.data_ptr(), *sizes)
         return grad_spikes, gradients
+
+
+def _read_out(spikes_SBN: Tensor, weight_ON: Tensor, bias_O: Tensor) -> Tensor:
+    """``[S, B, O]``: the spikes times a matrix, and a bias."""
+    (steps, batch, _), (outputs, neurons) = spikes_SBN.shape, weight_ON.shape
+    values_SBO = torch.empty(steps, batch, outputs)
+    spikes = pointer(spikes_SBN, FLOAT32, (None, None, neurons))
+    pointers = spikes, weight_ON.data_ptr(), bias_O.data_ptr(), values_SBO.data_ptr()
+    library().snn_read_out(*pointers, steps * batch, neurons, outputs, torch.get_num_threads())
+    return values_SBO

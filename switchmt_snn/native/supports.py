@@ -30,6 +30,7 @@ _SETTINGS: dict[str, object] = {
     "event_threshold": _ANY,
     "readout": ("mean", "last_membrane", "max_membrane"),
     "readout_beta": _ANY,
+    "quantiles": _ANY,
     "neuron": ("IF", "LIF"),
     "beta": _ANY,
     "alpha": _ANY,  # IF and LIF do not use these three

@@ -10,7 +10,13 @@ from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.runs.memory import MemoryEstimate, estimate_memory
 from switchmt_snn.spiking.folding import network_nodes
 from switchmt_snn.spiking.layers import SynapseNode
-from switchmt_snn.spiking.network import QNetwork, Stream, build_network, trainable_parameters
+from switchmt_snn.spiking.network import (
+    QNetwork,
+    Stream,
+    build_network,
+    deployed_parameters,
+    trainable_parameters,
+)
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -38,10 +44,15 @@ class LayerDescription:
 
 @dataclass(frozen=True)
 class MethodDescription:
-    """One of the seven methods under a config's other settings."""
+    """One of the seven methods under a config's other settings.
+
+    Attributes:
+        deployed_parameters: of the network that decides and is exported; fewer than are trained with quantiles.
+    """
 
     method: str
     trainable_parameters: int
+    deployed_parameters: int
     neurons: int
     timesteps: int
     dense_operations_per_decision: int
@@ -82,6 +93,7 @@ def describe_method(config: ExperimentConfig, suite: TaskSuite) -> MethodDescrip
     return MethodDescription(
         method=config.network.method,
         trainable_parameters=trainable_parameters(network),
+        deployed_parameters=deployed_parameters(network),
         neurons=neurons,
         timesteps=config.network.timesteps,
         dense_operations_per_decision=sum(layer.operations_per_step * layer.steps for layer in layers),

@@ -3,7 +3,7 @@
 BatchNorm (with a task's running statistics) and the dendritic gain of a task are affine maps of a layer's output
 channels, so a layer of task k is ``current = scale[k] * (W x) + shift[k]``, computed in float64. The two streams of a
 dueling network become one linear layer, channel after channel, and its head becomes ``[value | advantage minus its
-mean over actions]``: one plain chain with the same values.
+mean over actions]``: one plain chain with the same values. A head's quantiles become one output, their mean.
 
 Every module is recognized by its exact type. An unknown one is refused by name and never left out.
 
@@ -185,10 +185,9 @@ def network_nodes(network: QNetwork) -> NetworkNodes:
     for name, layer in network.trunk.items():
         trunk.append(_trunk_layer(name, layer, shape, tasks))
         shape = trunk[-1].output_shape
-    features = (math.prod(shape),)
-    return NetworkNodes(
-        tuple(trunk), {name: _stream(name, stream, features, tasks) for name, stream in network.streams.items()}
-    )
+    features, quantiles = (math.prod(shape),), network.config.quantiles
+    streams = {name: _stream(name, stream, features, quantiles, tasks) for name, stream in network.streams.items()}
+    return NetworkNodes(tuple(trunk), streams)
 
 
 def quantized(network: FoldedNetwork, bits: int = 8) -> FoldedNetwork:
@@ -330,7 +329,7 @@ def _normalize(node: SynapseNode, norm: TaskBatchNorm, tasks: range) -> None:
         node.shift_KO[task] = (node.shift_KO[task] - mean_O) * node.scale_KO[task] + _float64(norm.bias)
 
 
-def _stream(name: str, module: nn.Module, features: tuple[int, ...], tasks: range) -> StreamNodes:
+def _stream(name: str, module: nn.Module, features: tuple[int, ...], quantiles: int, tasks: range) -> StreamNodes:
     """A stream's hidden layer, with the gains of its dendrites in scale and shift, and its head."""
     _require(module, Stream, name)
     stream = cast(Stream, module)
@@ -349,7 +348,17 @@ def _stream(name: str, module: nn.Module, features: tuple[int, ...], tasks: rang
     if stream.k_winners is not None and stream.k_winners < outputs:
         hidden = replace(hidden, k_winners=stream.k_winners)
     neurons = _neurons(stream.neurons, outputs, name)
-    return StreamNodes(Layer(hidden, neurons), _dense(f"{name}.head", stream.head, hidden.output_shape, tasks))
+    return StreamNodes(Layer(hidden, neurons), _mean_head(name, stream, hidden.output_shape, quantiles, tasks))
+
+
+def _mean_head(name: str, stream: Stream, features: tuple[int, ...], quantiles: int, tasks: range) -> Dense:
+    """A stream's head. The mean over quantiles is linear, so their rows and biases become their means."""
+    head = _dense(f"{name}.head", stream.head, features, tasks)
+    if quantiles == 1:
+        return head
+    weight = head.weight.reshape(quantiles, -1, *features).mean(axis=0)
+    shift_KO = head.shift_KO.reshape(len(tasks), quantiles, -1).mean(axis=1)
+    return replace(head, weight=weight, scale_KO=np.ones_like(shift_KO), shift_KO=shift_KO, output_shape=(len(weight),))
 
 
 def _joined(streams: dict[str, StreamNodes]) -> tuple[Layer, Dense]:

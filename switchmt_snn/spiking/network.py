@@ -1,6 +1,6 @@
 """The Q-network of all seven methods.
 
-Shapes: T simulation steps, B batch, C channels, H W image, K tasks, A actions, N neurons.
+Shapes: T simulation steps, B batch, C channels, H W image, K tasks, A actions, M quantiles, N neurons.
 
     trunk  : nature   Conv 4->32 k8 s4 | Conv 32->64 k4 s2 | Conv 64->64 k3 s1, each with BatchNorm and neurons
              minatar  Conv c->16 k3 s1 with BatchNorm and neurons
@@ -8,6 +8,9 @@ Shapes: T simulation steps, B batch, C channels, H W image, K tasks, A actions, 
     stream : Linear ->hidden, gain of the active dendrites, neurons, Linear ->outputs
     plain  : one stream with A outputs                       (paper, section 3.1)
     dueling: Q = V + A - mean_a(A), a stream for each
+
+With M quantiles, a head has M sets of its outputs, one set after the other; each set gives one quantile of all actions,
+and Q is the mean over the sets.
 
 Stateless layers see time folded into the batch ``[T*B, ...]``; only neurons walk over T. Under direct encoding the
 first layer and its BatchNorm are computed once, since every step has the same input. The head is linear, so for the
@@ -116,6 +119,7 @@ class Stream(nn.Module):
     """Linear, normalization (if set), dendritic gain, neurons, linear head: one Q, value or advantage stream."""
 
     def __init__(self, config: NetworkConfig, num_features: int, num_outputs: int, num_tasks: int, spiking: bool):
+        """``num_outputs`` are those of one quantile."""
         super().__init__()
         hidden = cast(int, config.hidden_units)
         self.synapses = nn.Linear(num_features, hidden)
@@ -123,7 +127,7 @@ class Stream(nn.Module):
         self.dendrites = make_dendrites(config, hidden, num_tasks)
         self.k_winners = config.k_winners
         self.neurons = make_neuron_layer(config, spiking)
-        self.head = nn.Linear(hidden, num_outputs)
+        self.head = nn.Linear(hidden, config.quantiles * num_outputs)
 
     def context(self, task: int) -> tuple[Tensor, ...]:
         """The running mean and variance ``[N]`` with normalization, then the dendrites' index of a task ``[1]``."""
@@ -259,6 +263,21 @@ class QNetwork(nn.Module):
 
         ``training`` normalises by the batch or by the running statistics; None does as the module's mode says.
         """
+        return self.expected(
+            self.values(x, context, state=state, activity=activity, precision=precision, training=training)
+        )
+
+    def values(
+        self,
+        x: Tensor,
+        context: Context,
+        *,
+        state: State | None = None,
+        activity: dict[str, Tensor] | None = None,
+        precision: torch.dtype | None = None,
+        training: bool | None = None,
+    ) -> Tensor:
+        """As ``decide``, but with several quantiles their values ``[B, M, A]``, which training learns."""
         training = self.training if training is None else training
         state = {} if state is None else state
         for name, layer in self.trunk.items():
@@ -272,6 +291,10 @@ class QNetwork(nn.Module):
             for name, stream in self.streams.items()
         }
         return self.readout.q_values(self.combine(outputs))
+
+    def expected(self, values: Tensor) -> Tensor:
+        """Q-values ``[B, A]`` of what ``values`` returned: the mean over quantiles."""
+        return values if self.config.quantiles == 1 else values.mean(-2)
 
     def _over_time(self, current: Tensor) -> Tensor:
         """Repeat ``[1, B, ...]`` over T: direct encoding's first layer has the same current at every step."""
@@ -303,7 +326,8 @@ class QNetwork(nn.Module):
     ) -> Tensor:
         current_TBN = stream.current(features_TBN, context, precision, training)
         spikes_TBN = self._fire(name, stream, current_TBN, state, activity)
-        return self.readout.stream(stream.head, spikes_TBN)
+        outputs = self.readout.stream(stream.head, spikes_TBN)
+        return outputs if self.config.quantiles == 1 else outputs.unflatten(-1, (self.config.quantiles, -1))
 
     def combine(self, outputs: dict[str, Tensor]) -> Tensor:
         """Q-values ``[..., A]`` from the streams' outputs ``[..., n]``."""
@@ -326,3 +350,9 @@ def build_network(config: NetworkConfig, observation: ObservationSpec, seed: int
 def trainable_parameters(network: nn.Module) -> int:
     """Number of trainable parameters (paper, Table 3)."""
     return sum(parameter.numel() for parameter in network.parameters() if parameter.requires_grad)
+
+
+def deployed_parameters(network: QNetwork) -> int:
+    """Parameters of the network that decides: of a head's quantiles, only their mean."""
+    heads = sum(trainable_parameters(cast(Stream, stream).head) for stream in network.streams.values())
+    return trainable_parameters(network) - heads + heads // network.config.quantiles

@@ -76,12 +76,12 @@ class Native(Engine):
         online, target, double_q = self._online, self._target, self.config.double_q
         x_next = target.inputs(next_observations, generator)
         with torch.no_grad():
-            (next_BA,) = target.decide(x_next, target.for_task(task), training=False)
+            (next_values,) = target.decide(x_next, target.for_task(task), training=False)
         if double_q and self.network.encoder.is_random:
             x_next = online.inputs(next_observations, generator)
         x, others = online.inputs(observations, generator), [x_next] if double_q else []
-        q_BA, *choice = online.decide(x, online.for_task(task), training=True, other_inputs=others)
-        return Values(q_BA, next_BA, *(choice or [next_BA]))
+        values, *choice = online.decide(x, online.for_task(task), training=True, other_inputs=others)
+        return Values(values, next_values, *(choice or [self.target.expected(next_values)]))
 
     def decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
         """See ``Engine.decisions``."""

@@ -2,8 +2,6 @@
 
 One compilation serves all tasks, because a task enters as tensors (``QNetwork.context``), and all steps, because an
 update's batch has one size.
-
-Shapes: B batch, A actions.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ Encoded = Callable[[Tensor, Tensor, Tensor, Context, Context], Values]
 
 
 class DifferentiatedPass(nn.Module):
-    """The pass that has a gradient, ``[B, A]``, as a module, because DistributedDataParallel takes modules."""
+    """The pass that has a gradient, as a module, because DistributedDataParallel takes modules."""
 
     def __init__(self, network: QNetwork, precision: torch.dtype | None) -> None:
         super().__init__()
@@ -32,8 +30,8 @@ class DifferentiatedPass(nn.Module):
         self.precision = precision
 
     def forward(self, x: Tensor, context: Context) -> Tensor:
-        """Q-values of encoded inputs in training mode."""
-        return self.network.decide(x, context, precision=self.precision, training=True)
+        """``Values.online`` of encoded inputs."""
+        return self.network.values(x, context, precision=self.precision, training=True)
 
 
 def forward_passes(
@@ -61,10 +59,12 @@ def forward_passes(
             x, x_next = network.encode(x), network.encode(x_next)
             x_choice = x_next
         with torch.no_grad():
-            choice_BA = next_BA = target.decide(x_next, target_context, precision=precision, training=False)
+            next_values = target.values(x_next, target_context, precision=precision, training=False)
             if double_q:
                 choice_BA = network.decide(x_choice, context, precision=precision, training=False)
-        return Values(differentiated(x, context), next_BA, choice_BA)
+            else:
+                choice_BA = target.expected(next_values)
+        return Values(differentiated(x, context), next_values, choice_BA)
 
     run = values if compile_ is None else compile_(values)
 

@@ -3,7 +3,7 @@
 All engines compute the same function with other roundings (tests compare them). A membrane that lies within rounding of
 the threshold may fire in one engine and not in another, as between any two orders of a sum.
 
-Shapes: B batch, A actions.
+Shapes: B batch, A actions, M quantiles.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from switchmt_snn.spiking.network import QNetwork
 
 
 class Values(NamedTuple):
-    """What Eq. 2 needs, each ``[B, A]``."""
+    """What Eq. 2 needs. Values are ``[B, A]``, or with several quantiles ``[B, M, A]``."""
 
-    q_BA: Tensor
-    """Q of the observations, in training mode, with a gradient."""
-    next_BA: Tensor
-    """Q* of the next observations, in eval mode."""
+    online: Tensor
+    """Values of the observations by Q, in training mode, with a gradient."""
+    target: Tensor
+    """Values of the next observations by Q*, in eval mode."""
     choice_BA: Tensor
-    """Q of the next observations, in eval mode; Q* without double Q-learning."""
+    """Q-values of the next observations by Q, in eval mode; by Q* without double Q-learning."""
 
 
 class DeviceBatch(NamedTuple):

@@ -226,6 +226,9 @@ def layers_table(method: MethodDescription) -> Table:
         f"memory: replay {memory.replay_bytes / GIB:.2f} GiB, networks and optimiser {memory.network_bytes / GIB:.2f}, "
         f"snapshots {memory.switching_bytes / GIB:.2f}, activations {memory.activations_bytes / GIB:.2f}"
     )
+    if method.deployed_parameters != method.trainable_parameters:
+        trained, deployed = method.trainable_parameters, method.deployed_parameters
+        parts += f"; {trained:,} parameters are trained, {deployed:,} decide and are exported"
     table = _table(f"Layers of {method.method}", parts)
     _add_columns(table, ("layer",), ("input", "output", "parameters", "neurons", "ops/step", "steps"))
     for layer in method.layers:

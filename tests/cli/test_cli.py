@@ -60,6 +60,21 @@ def test_describe_shows_the_configs_own_network(capsys) -> None:
     assert counts["DQN"] == TABLE_3["DQN"]
 
 
+def test_describe_names_trained_and_deployed_parameters(capsys) -> None:
+    """32 quantiles add 31 times the heads in training; what decides has the paper's count."""
+    flags = ["describe", "--network.quantiles", "32", "--learning.loss", "huber"]
+    _, out, _ = call(capsys, *flags, "--json")
+    for name, facts in json.loads(out)["methods"].items():
+        heads = 513 * (18 + (TABLE_3[name] > TABLE_3["MTSpark_AD"]))
+        assert facts["trainable_parameters"] == TABLE_3[name] + 31 * heads
+        assert facts["deployed_parameters"] == TABLE_3[name]
+        assert sum(layer["parameters"] for layer in facts["layers"]) == facts["trainable_parameters"]
+    _, out, _ = call(capsys, *flags)
+    assert "3,602,514 parameters are trained, 3,300,357 decide" in " ".join(out.split())
+    _, out, _ = call(capsys, "describe")
+    assert "are trained" not in out
+
+
 def test_describe_table_names_every_method(capsys) -> None:
     _, out, _ = call(capsys, "describe", "minatar")
     for method in METHODS:

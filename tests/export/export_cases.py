@@ -28,6 +28,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "events": {"encoding": "events", "tasks": STACKED},
     "last_membrane": {"readout": "last_membrane", "readout_beta": 0.5},
     "max_membrane": {"readout": "max_membrane"},
+    "quantiles": {"quantiles": 5},
+    "quantiles last_membrane": {"quantiles": 8, "readout": "last_membrane", "method": "MTSpark_AD"},
     "subtract": {"reset": "subtract"},
     "LIF": {"neuron": "LIF"},
     "LIF subtract": {"neuron": "LIF", "beta": 0.75, "reset": "subtract"},
@@ -51,7 +53,8 @@ def make_agent(seed: int = 0, **network: Any) -> Agent:
     """An agent on three MinAtar games; ``tasks`` changes its tasks, everything else its network."""
     tasks = {"suite": "minatar", "names": ["breakout", "asterix", "space_invaders"], **network.pop("tasks", {})}
     settings = {"hidden_units": 32, "threshold": 0.5, **network}
-    config = resolve(from_dict({"name": "export", "tasks": tasks, "network": settings}))
+    learning = {"loss": "huber"} if "quantiles" in network else {}
+    config = resolve(from_dict({"name": "export", "tasks": tasks, "network": settings, "learning": learning}))
     suite = make_suite(config.tasks)
     built = build_network(config.network, observation_spec(suite), seed)
     generator = torch.Generator().manual_seed(seed)

@@ -82,11 +82,12 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     encoding=st.sampled_from(sorted(ENCODINGS)),
     neuron=st.sampled_from(list(NEURONS)),
     readout=st.sampled_from(list(READOUTS)),
+    quantiles=st.sampled_from([1, 1, 3, 4]),
     normalization=st.sampled_from(["per_task", "shared"]),
     seed=st.integers(0, 2**20),
 )
 def test_any_network_is_exported_bitwise(
-    method, reset, timesteps, dendrites, encoding, neuron, readout, normalization, seed
+    method, reset, timesteps, dendrites, encoding, neuron, readout, quantiles, normalization, seed
 ) -> None:
     """On exact numbers, whatever the combination; EXPORT_EXAMPLES=500 looks at more of them."""
     traits = METHOD_TRAITS[method]
@@ -96,6 +97,8 @@ def test_any_network_is_exported_bitwise(
         network["tasks"] = {"frame_stack": ENCODINGS[encoding].steps(timesteps) or 2}
     if traits.dendrites:
         network["dendrites"] = dendrites
+    if network.get("readout") != "max_membrane":
+        network["quantiles"] = quantiles
     agent = make_agent(seed, **network)
     x = dyadic_observations(observations(agent, 6, seed))
     agent, exact = exact_copy(agent, [x] * 3)

@@ -23,7 +23,7 @@ def test_double_q_target_by_hand() -> None:
     target = td_target(
         rewards_B=torch.tensor([1.0, 1.0, -0.5]),
         terminated_B=torch.tensor([False, True, False]),
-        q_next_BA=torch.tensor([[10.0, 20.0], [10.0, 20.0], [3.0, 4.0]]),
+        next_values=torch.tensor([[10.0, 20.0], [10.0, 20.0], [3.0, 4.0]]),
         q_choice_BA=torch.tensor([[5.0, 1.0], [5.0, 1.0], [0.0, 0.5]]),  # chooses 0, 0, 1
         discounts_B=torch.tensor([0.5, 0.5, 0.25]),
     )

@@ -11,7 +11,7 @@ from tests.conftest import small_config
 
 
 def network_of(actions: int = 6, **settings: object) -> QNetwork:
-    config = small_config(network={"trunk": "mlp", "hidden_units": 37, **settings})
+    config = small_config(network={"trunk": "mlp", "hidden_units": 37, **settings}, learning={"loss": "huber"})
     return build_network(resolve(config).network, ObservationSpec((7,), 1, 1.0, True, actions, 3), 1)
 
 

@@ -44,18 +44,24 @@ def test_a_stream_without_dendrites_has_gains_of_one() -> None:
 
 
 @pytest.mark.parametrize("method", ["DSQN", "SwitchMT"])
-@pytest.mark.parametrize(("steps", "batch", "actions"), [(1, 32, 6), (4, 3, 18), (2, 5, 1)])
-def test_heads_are_those_of_the_network(method: str, steps: int, batch: int, actions: int) -> None:
-    network = network_of(actions, method=method)
+@pytest.mark.parametrize(
+    ("steps", "batch", "actions", "quantiles"),
+    [(1, 32, 6, 1), (4, 3, 18, 1), (2, 5, 1, 1), (1, 11, 6, 4), (2, 2, 18, 32)],
+)
+def test_heads_are_those_of_the_network(method: str, steps: int, batch: int, actions: int, quantiles: int) -> None:
+    network = network_of(actions, method=method, quantiles=quantiles)
     streams, heads = streams_of(network), Heads(network)
     spikes = (torch.rand(steps, batch, 37 * len(streams)) < 0.4).float()
     for _ in range(2):  # the second time with other parameters
         heads.read()
         x = spikes.clone().requires_grad_()
         parts = zip(network.streams, streams, x.split(37, dim=-1), strict=True)
-        theirs = network.combine({name: stream.head(part) for name, stream, part in parts})
+        outputs = {name: stream.head(part).unflatten(-1, (quantiles, -1)) for name, stream, part in parts}
+        values = network.combine(outputs)  # [S, B, M, A]
+        torch.testing.assert_close(heads.means(spikes), values.detach().mean(2), rtol=1e-5, atol=1e-6)
+        theirs = values.flatten(2)
         torch.testing.assert_close(heads.outputs(spikes), theirs.detach(), rtol=1e-5, atol=1e-6)
-        weights = torch.randn(theirs.shape)
+        weights = torch.randn(theirs.shape) * (torch.rand(theirs.shape) < 0.5)  # some outputs without a gradient
         their_gradients = torch.autograd.grad((theirs * weights).sum(), [x, *heads.parameters])
         ours, of_heads = heads.gradients(spikes, weights, 0.25)
         for our, their in zip((ours * 4, *of_heads), their_gradients, strict=True):

@@ -141,8 +141,17 @@ def test_killed_at_random_moments_ends_bitwise_the_same(config: Path, whole: Pat
 
 
 @pytest.mark.skipif(compile_problem() is not None, reason="nothing can be compiled here")
-@pytest.mark.parametrize("engine", ["compiled", "native"])
-def test_a_compiled_run_continues_exactly_in_another_process(config: Path, tmp_path: Path, engine: str) -> None:
+@pytest.mark.parametrize(
+    ("engine", "more"),
+    [
+        ("compiled", ()),
+        ("native", ()),
+        ("native", ("--network.quantiles", "4", "--learning.loss", "huber")),
+    ],
+)
+def test_a_compiled_run_continues_exactly_in_another_process(
+    config: Path, tmp_path: Path, engine: str, more: tuple[str, ...]
+) -> None:
     options = (
         "--learning.engine",
         engine,
@@ -151,6 +160,7 @@ def test_a_compiled_run_continues_exactly_in_another_process(config: Path, tmp_p
         "--network.encoding",
         "direct",
         "--learning.overlap",
+        *more,
     )
     run("train", config, "--run", tmp_path / "whole", *options)
     assert f"engine: {engine}" in (tmp_path / "whole" / "config.yaml").read_text()

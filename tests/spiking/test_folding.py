@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from switchmt_snn.config import ExperimentConfig, NetworkConfig, resolve
+from switchmt_snn.config import ExperimentConfig, LearningConfig, NetworkConfig, resolve
 from switchmt_snn.errors import ExportError, TaskError
 from switchmt_snn.spiking.folding import fold, network_nodes
 from switchmt_snn.spiking.layers import Conv, Dense, NeuronNode, ReadoutNode, no_rule, side_by_side
@@ -82,6 +82,32 @@ def test_a_module_that_has_no_node_is_refused_by_name(network: QNetwork) -> None
             network_nodes(network)
         setattr(owner, part, kept)
     network_nodes(network)
+
+
+@pytest.mark.parametrize(("method", "readout"), [("SwitchMT", "mean"), ("DSQN", "last_membrane"), ("DQN_D", "mean")])
+def test_quantiles_fold_into_one_output_each_their_mean(method: str, readout: str) -> None:
+    """The head has the shape of a network without quantiles, and computes the Q-values that the network acts by."""
+    settings = NetworkConfig(
+        method=method, trunk="minatar", hidden_units=8, quantiles=5, readout=readout, threshold=0.3
+    )
+    config = ExperimentConfig(network=settings, learning=LearningConfig(loss="huber"))
+    network = build_network(resolve(config).network, SPEC, 0).eval()
+    activity: dict[str, torch.Tensor] = {}
+    x = torch.rand(6, 4, 10, 10)
+    q_BA = network(x, 1, activity=activity).detach()
+    values_BMA = network.values(network.encode(x), network.context(1)).detach()
+    assert values_BMA.shape == (6, 5, 3)
+    torch.testing.assert_close(values_BMA.mean(1), q_BA)
+    assert (values_BMA.std(1) > 1e-3).all()
+    folded = fold(network)
+    weight, bias = folded.head.folded(1)
+    assert weight.shape == (3, 8 * len(network.streams))
+    spikes_TBN = torch.cat([activity[name] for name in network.streams], dim=-1)
+    seen = folded.readout((spikes_TBN @ torch.from_numpy(weight).T + torch.from_numpy(bias)).detach().numpy())
+    np.testing.assert_allclose(seen, q_BA.numpy(), rtol=1e-5, atol=1e-5)
+    assert {name: stream.head.output_shape for name, stream in network_nodes(network).streams.items()} == (
+        {"q": (3,)} if method == "DSQN" else {"value": (1,), "advantage": (3,)}
+    )
 
 
 def test_a_bare_network_gets_numbered_names(network: QNetwork) -> None:

@@ -21,11 +21,18 @@ SIZE = 12
 
 
 def config() -> ExperimentConfig:
-    """A convolution with BatchNorm, and dendrites; gradients are clipped by norm."""
+    """A convolution with BatchNorm, dendrites, and quantiles; gradients are clipped by norm."""
     return small_config(
         tasks={"suite": "minatar", "names": ["breakout", "asterix"]},
-        network={"trunk": "minatar", "hidden_units": 16, "timesteps": 3, "threshold": 0.5, "dendrites": "per_neuron"},
-        learning={"batch_size": SIZE, "gradient_clip": "norm", "gradient_clip_at": 0.05},
+        network={
+            "trunk": "minatar",
+            "hidden_units": 16,
+            "timesteps": 3,
+            "threshold": 0.5,
+            "dendrites": "per_neuron",
+            "quantiles": 3,
+        },
+        learning={"batch_size": SIZE, "gradient_clip": "norm", "gradient_clip_at": 0.05, "loss": "huber"},
     )
 
 

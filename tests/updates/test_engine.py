@@ -37,7 +37,8 @@ OTHER_NEURONS = {
 
 def minatar(**network: Any) -> ExperimentConfig:
     preset = load_config("minatar")
-    return resolve(replace(preset, network=replace(preset.network, hidden_units=16, **network)))
+    learning = replace(preset.learning, loss="huber" if "quantiles" in network else preset.learning.loss)
+    return resolve(replace(preset, network=replace(preset.network, hidden_units=16, **network), learning=learning))
 
 
 def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | None, task: int) -> dict[str, Any]:
@@ -55,10 +56,10 @@ def gradients(config: ExperimentConfig, engine: str, precision: torch.dtype | No
     x, following = (torch.rand(2, 8, *images.shape) < 0.4).to(torch.uint8)
     learning = replace(config.learning, double_q=True, precision="bfloat16" if precision else "float32")
     values = ENGINES[engine](network, target, learning).values(x, following, task, torch.Generator().manual_seed(5))
-    q_BA = values.q_BA
-    (q_BA * torch.linspace(-1, 2, q_BA.numel()).view_as(q_BA)).sum().backward()
-    assert not values.next_BA.requires_grad
-    assert not torch.equal(values.next_BA, values.choice_BA)
+    online = values.online
+    (online * torch.linspace(-1, 2, online.numel()).view_as(online)).sum().backward()
+    assert not values.target.requires_grad
+    assert not torch.equal(values.target, values.choice_BA)
     # Each gradient in units of its tensor's largest, which is what Adam makes of it; but biases before BatchNorm have
     # none except rounding.
     grads = {
@@ -87,8 +88,9 @@ builds = pytest.mark.skipif(not ENGINES["native"].status().startswith("works"), 
         OTHER_NEURONS,
         {"encoding": "rate", "surrogate": "sigmoid", "readout": "max_membrane", "k_winners": 5},
         {"method": "DQN_D"},
+        {"quantiles": 4},
     ],
-    ids=["default", "LIF-subtract", "rate", "ANN"],
+    ids=["default", "LIF-subtract", "rate", "ANN", "quantiles"],
 )
 def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
     _compare_to_rounding("compiled", network)
@@ -111,8 +113,20 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
         {"trunk": "mlp", "threshold": 0.2},
         {"trunk": "mlp", "mlp_normalization": "batch", "stream_normalization": "batch"},
         {"trunk": "nature", "threshold": 0.5},
+        {"quantiles": 4},
+        {"quantiles": 3, "readout": "last_membrane", "method": "DSQN"},
     ],
-    ids=["default", "LIF-subtract", "rate", "latency", "mlp", "mlp-normalized", "nature"],
+    ids=[
+        "default",
+        "LIF-subtract",
+        "rate",
+        "latency",
+        "mlp",
+        "mlp-normalized",
+        "nature",
+        "quantiles",
+        "quantiles-last",
+    ],
 )
 def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
     _compare_to_rounding("native", network)
@@ -121,7 +135,7 @@ def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any])
 @builds
 @pytest.mark.parametrize("copies", [1, 8, 40])  # 40: more lanes than a panel of few
 @pytest.mark.parametrize(
-    "network", [{}, OTHER_NEURONS, {"readout": "max_membrane"}, {"trunk": "nature"}, {"trunk": "mlp"}]
+    "network", [{}, OTHER_NEURONS, {"readout": "max_membrane"}, {"trunk": "nature"}, {"trunk": "mlp"}, {"quantiles": 5}]
 )
 def test_native_decisions_are_the_eager_ones_to_rounding(network: dict[str, Any], copies: int) -> None:
     """Also after an update has changed the weights."""
