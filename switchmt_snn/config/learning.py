@@ -18,6 +18,9 @@ class LearningConfig:
     """Transitions per update; all from one task."""
     learning_rate: float = 1e-4
     """Adam's learning rate."""
+    learning_rate_decay_updates: int | None = None
+    """Lower the learning rate linearly to 0 over this many updates; null keeps it. Later updates do not
+    change the weights."""
     adam_epsilon: float = 1e-8
     """Adam's epsilon."""
     discount: float = 0.99
@@ -85,6 +88,8 @@ class LearningConfig:
         check_fields(self, "learning")
         require(self.batch_size >= 2, "learning.batch_size", self.batch_size, "at least 2", "BatchNorm needs a batch")
         require(self.learning_rate > 0, "learning.learning_rate", self.learning_rate, "above 0")
+        decay = self.learning_rate_decay_updates
+        require(decay is None or decay >= 1, "learning.learning_rate_decay_updates", decay, "at least 1 or null")
         require(self.adam_epsilon > 0, "learning.adam_epsilon", self.adam_epsilon, "above 0")
         require(0.0 <= self.discount <= 1.0, "learning.discount", self.discount, "within [0, 1]")
         require(self.gradient_clip_at > 0, "learning.gradient_clip_at", self.gradient_clip_at, "above 0")

@@ -18,6 +18,7 @@ from torch.nn import Parameter
 
 from switchmt_snn.config import LearningConfig
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.clocks import linear_decay
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.replay.on_device import to_device
 from switchmt_snn.replay.ring import Batch
@@ -192,9 +193,17 @@ class Learner(Stateful):
             terminated_B=self._tensor(batch.terminated),
             discounts_B=self._tensor(batch.discounts),
         )
+        self._decay_learning_rate()
         self._step(parts, task)
         self.updates += 1
         self.summed += 1
+
+    def _decay_learning_rate(self) -> None:
+        decay_updates = self.config.learning_rate_decay_updates
+        if decay_updates is not None:
+            rate = linear_decay(self.config.learning_rate, 0.0, decay_updates, self.updates)
+            for group in self.optimizer.param_groups:
+                group["lr"] = rate
 
     def _device_step(self, batch: DeviceBatch, task: int) -> None:
         """All of an update that happens on the device; nothing here may read a number back to the host."""

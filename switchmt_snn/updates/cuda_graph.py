@@ -38,6 +38,8 @@ class CudaGraph(Engine):
         """See ``Engine.unavailable``."""
         if device.type != "cuda":
             return f"this one is on device {device.type}"
+        if config.learning.learning_rate_decay_updates is not None:
+            return "a captured update keeps its learning rate, and learning.learning_rate_decay_updates changes it"
         return super().unavailable(config, device, processes)
 
     @classmethod

@@ -94,6 +94,25 @@ def test_masked_target_equals_the_one_of_the_only_action() -> None:
 
 
 @pytest.mark.parametrize("engine", ["eager", pytest.param("native", marks=builds)])
+def test_the_learning_rate_falls_to_zero_over_updates_and_a_state_continues_it(engine: str) -> None:
+    settings = {"engine": engine, "learning_rate": 0.004, "learning_rate_decay_updates": 4}
+    part = learner(**settings)
+    rates, moved = [], []
+    for number in range(6):
+        if number == 2:
+            part, saved = learner(**settings), part.state_dict()
+            part.load_state_dict(saved)
+        before = part.parameters()
+        part.update(batch(), 0)
+        rates.append(part.optimizer.param_groups[0]["lr"])
+        moved.append(float((part.parameters() - before).abs().max()))
+    assert rates == pytest.approx([0.004, 0.003, 0.002, 0.001, 0.0, 0.0])
+    assert moved[0] == pytest.approx(0.004, rel=1e-3)  # Adam's first step has the size of its rate
+    assert moved[3] > 0.0
+    assert moved[4] == moved[5] == 0.0
+
+
+@pytest.mark.parametrize("engine", ["eager", pytest.param("native", marks=builds)])
 def test_losses_and_clipping_change_the_update(engine: str) -> None:
     results = set()
     for settings in ({}, {"loss": "huber"}, {"gradient_clip": "value", "gradient_clip_at": 1e-3}, {"double_q": False}):

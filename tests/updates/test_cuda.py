@@ -19,6 +19,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.replay.ring import Batch, FrameReplay, Returns
 from switchmt_snn.spiking.network import ObservationSpec, build_network
+from switchmt_snn.updates.cuda_graph import CudaGraph
 from tests.conftest import decided, small_config
 
 CPU = torch.device("cpu")
@@ -97,6 +98,15 @@ def test_everything_that_an_update_changes_stays_where_it_is() -> None:
     learner.copy_target()
     learner.take_means()
     assert places() == before
+
+
+def test_a_graph_refuses_a_learning_rate_that_falls() -> None:
+    """The captured step holds the rate as a constant."""
+    config = small_config(learning={"learning_rate_decay_updates": 100})
+    reason = CudaGraph.unavailable(config, torch.device("cuda"))
+    assert reason is not None
+    assert "learning.learning_rate_decay_updates" in reason
+    assert CudaGraph.unavailable(small_config(), torch.device("cuda")) is None
 
 
 def test_a_graph_needs_a_cuda_device() -> None:
