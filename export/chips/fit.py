@@ -99,12 +99,15 @@ class ChipFit:
 def layer_shapes(network: FoldedNetwork) -> tuple[LayerShape, ...]:
     """Shapes of all layers, the head last; the two streams of a dueling network are layers of their own.
 
+    A chip holds one task's head.
+
     This is the only function of this package that reads a network's description for its shapes.
 
     Raises:
         ExportError: a kernel is not square, or has padding.
     """
     shapes: list[LayerShape] = []
+    network = network.of_task(0)
     sees_spikes, sees = network.sees_spikes, network.encoded_shape
     for node, neurons in zip(network.synapses, [*(layer.neurons for layer in network.layers), None], strict=True):
         shapes += [

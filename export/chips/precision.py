@@ -21,7 +21,7 @@ def at_precision(network: FoldedNetwork, task: int, bits: int) -> FoldedNetwork:
 
     Everything that multiplies a weight is folded in before rounding. Biases, thresholds and membranes stay float32.
     """
-    return network.with_synapses(lambda node: _rounded(node, task, bits))
+    return network.of_task(task).with_synapses(lambda node: _rounded(node, task, bits))
 
 
 def _rounded(node: SynapseNode, task: int, bits: int) -> SynapseNode:

@@ -177,7 +177,7 @@ class TaskCounter:
 
     def __init__(self, agent: Agent, task: int) -> None:
         """Start at nothing; ``task`` is a task's index."""
-        self.agent, self.task, self.network = agent, task, fold_agent(agent)
+        self.agent, self.task, self.network = agent, task, fold_agent(agent).of_task(task)
         self._synapses = [SynapseCounter(_counted(self.network, node, task)) for node in self.network.synapses]
         self._steps = self.network.settings.timesteps
         self._neurons = [NeuronCounter(layer.name, layer.output_shape, self._steps) for layer in self.network.layers]

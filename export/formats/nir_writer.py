@@ -65,6 +65,7 @@ def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable
     """
     if dialect not in _DT:
         raise ExportError(f"the NIR dialect is {dialect!r}, expected one of {', '.join(_DT)}")
+    network = network.of_task(task)
     chain = _Chain("input", {"input": nir.Input({"input": np.array(network.encoded_shape)})})
     shape = network.encoded_shape
     for layer in network.layers:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.export.formats.onnx_graph import FLOAT, Graph
-from switchmt_snn.spiking.layers import Array, Conv, Dense, Layer, NeuronNode, SynapseNode, no_rule
+from switchmt_snn.spiking.layers import Array, Conv, Dense, Layer, NeuronNode, SynapseNode, TaskDense, no_rule
 from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, ReLUNode, SynapticNode
 
 _REMEDY = "add a rule to export/formats/onnx_nodes.py"
@@ -86,14 +86,27 @@ def _(node: Dense, graph: Graph, weights: list[str], x: str) -> str:
     return graph.add("Gemm", [flat, *weights], f"{node.name}_synapses", transB=1)
 
 
+@_products.register
+def _(node: TaskDense, graph: Graph, weights: list[str], x: str) -> str:
+    """The outputs of all tasks, then of each row those of its task."""
+    name = node.name
+    flat = graph.add("Flatten", [x], f"{name}_input", axis=1)
+    every = graph.add("Gemm", [flat, *weights], f"{name}_of_all_tasks", transB=1)
+    shape = graph.constant(f"{name}_by_task", [0, -1, node.outputs], np.int64)
+    by_task = graph.add("Reshape", [every, shape], f"{name}_tasks")
+    index = graph.add("Unsqueeze", ["task", graph.constant("axis_1", [1], np.int64)], f"{name}_task")
+    return graph.add("GatherND", [by_task, index], f"{name}_synapses", batch_dims=1)
+
+
 @singledispatch
 def _competition(node: SynapseNode, graph: Graph, current: str) -> str:
     """The currents that are left when a layer's outputs have competed."""
     raise no_rule("ONNX", node, _competition.registry, _REMEDY)
 
 
-@_competition.register
-def _(node: Conv, graph: Graph, current: str) -> str:
+@_competition.register(Conv)
+@_competition.register(TaskDense)
+def _(node: SynapseNode, graph: Graph, current: str) -> str:
     return current
 
 

@@ -38,7 +38,7 @@ def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.Mode
     drew. Outputs are ``q_values`` ``[B, A]``, -inf where an action does not exist in the task, and for spiking networks
     ``spike_counts`` int64 ``[B, L]``: spikes of each neuron layer over T.
     """
-    graph = Graph()
+    graph, network = Graph(), network if task is None else network.of_task(task)
     inputs = [observation_input(network)]
     if task is None:
         inputs.append(helper.make_tensor_value_info("task", INT64, ["batch"]))
@@ -71,7 +71,7 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
     """
     if not network.spiking:
         raise ExportError("an ANN method has no simulation steps, expected a spiking one; use the decision graph")
-    graph = Graph()
+    graph, network = Graph(), network if task is None else network.of_task(task)
     inputs = [helper.make_tensor_value_info("encoded", FLOAT, ["batch", *network.encoded_shape])]
     if task is None:
         inputs.append(helper.make_tensor_value_info("task", INT64, ["batch"]))

@@ -80,7 +80,8 @@ def dyadic_copy(agent: Agent, weight_bits: int = 5) -> Agent:
             elif isinstance(module, NeuronLayer):
                 _round_neurons(module)
         for name, stream in network.streams.items():
-            _exact_means(cast(Stream, stream).head, network.config.quantiles, over_actions=name == "advantage")
+            outputs = network.observation.num_actions if name != "value" else 1
+            _exact_means(cast(Stream, stream).head, network.config.quantiles, outputs, name == "advantage")
     scale = agent.suite.scale if math.log2(agent.suite.scale).is_integer() else 2.0**-8
     network.observation = replace(network.observation, scale=scale)
     return Agent(network, replace(agent.suite, scale=scale), agent.config, torch.device("cpu"), agent.step)
@@ -276,15 +277,15 @@ def _round_dendrites(module: ActiveDendrites) -> None:
         module.segments_NSK[:, :, task] = best.view(rows, 1)
 
 
-def _exact_means(head: nn.Linear, quantiles: int, over_actions: bool) -> None:
+def _exact_means(head: nn.Linear, quantiles: int, outputs: int, over_actions: bool) -> None:
     """Means over actions and over quantiles that are exact for any number of them.
 
     Advantages sum to zero over the actions. Quantiles lie in pairs around the first one, with equal distances.
     """
     half = quantiles // 2
     for part in (head.weight, head.bias):
-        sets = part.unflatten(0, (quantiles, -1))  # a view: [M, outputs, ...]
-        if over_actions:
-            sets[:, -1] = -sets[:, :-1].sum(1)
-        center, distances = sets[0].clone(), sets[:half].clone()
-        sets[:half], sets[half : 2 * half], sets[2 * half :] = center + distances, center - distances, center
+        for sets in part.unflatten(0, (-1, quantiles, outputs)):  # views: [M, outputs, ...], one per head of a task
+            if over_actions:
+                sets[:, -1] = -sets[:, :-1].sum(1)
+            center, distances = sets[0].clone(), sets[:half].clone()
+            sets[:half], sets[half : 2 * half], sets[2 * half :] = center + distances, center - distances, center

@@ -23,6 +23,9 @@ class NetworkConfig:
     """Feature layers: three convolutions (84x84), one (10x10), or one linear layer; auto follows tasks.suite."""
     hidden_units: int | None = None
     """Units of each stream's hidden layer; null takes 512 for nature and 128 otherwise."""
+    heads: Literal["shared", "per_task"] = "shared"
+    """The last linear layer of each stream: one for all tasks (paper), or one for each task. An export for a task holds
+    that task's only."""
     timesteps: int = 4
     """Simulation steps T per decision; ANN methods have none and resolve to 1."""
     encoding: EncodingName | PluginName = "direct"

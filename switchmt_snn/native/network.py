@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from switchmt_snn.native import supports
 from switchmt_snn.native.neurons import Currents, Form, Neurons, Spikes, batch_moments, scaled_images
 from switchmt_snn.native.products import Gradients, Synapses, connected, convolved
-from switchmt_snn.native.streams import Gains, Heads
+from switchmt_snn.native.streams import Gains, HeadMatrix, Heads
 from switchmt_snn.native.supports import spikes_as_bits
 from switchmt_snn.spiking.network import Context, QNetwork, Stream, TrunkLayer
 
@@ -38,6 +38,7 @@ class TaskParameters(NamedTuple):
     task: int
     gain_N: Tensor
     """Gains of the dendrites of all streams, one stream after the other."""
+    heads: HeadMatrix
     context: Context
 
 
@@ -110,14 +111,13 @@ class NativeNetwork:
             if version != self._copied_version:
                 for synapses in self._synapses:
                     synapses.read()
-            self._heads.read()
             self._copied_version = self._version = version
             self._by_task = {}
         if task not in self._by_task:
             gain_N = self._gains.of_task(task)
             if task not in self._contexts:
                 self._contexts[task] = self._network.context(task)  # views, which see changes
-            self._by_task[task] = TaskParameters(task, gain_N, self._contexts[task])
+            self._by_task[task] = TaskParameters(task, gain_N, self._heads.of_task(task), self._contexts[task])
         return self._by_task[task]
 
     def act(self, x: Tensor, parameters: TaskParameters) -> Tensor:
@@ -135,7 +135,7 @@ class NativeNetwork:
             (y_TBN,), _ = connected([features], self._streams)
             currents = self._stream_currents(y_TBN, parameters, training=False)
             spikes_SBN, _ = self._neurons.fire(y_TBN, currents, self._last_form)
-            output_SBA = self._heads.means(spikes_SBN)
+            output_SBA = parameters.heads.means(spikes_SBN)
         return self._over_steps(output_SBA[0] if self._is_mean else output_SBA)
 
     def decide(
@@ -190,8 +190,8 @@ class NativeNetwork:
         currents = [self._stream_currents(ys[0], parameters, training), *currents]
         fired = [self._neurons.fire(y, current, self._last_form) for y, current in zip(ys, currents, strict=True)]
         # The backward keeps only the first input's activations alive, and not its own outputs.
-        y_TBN, (spikes_SBN, currents_4N) = ys[0], fired[0]
-        outputs = [self._heads.outputs(spikes_SBN), *(self._heads.means(other_SBN) for other_SBN, _ in fired[1:])]
+        y_TBN, (spikes_SBN, currents_4N), heads = ys[0], fired[0], parameters.heads
+        outputs = [heads.outputs(spikes_SBN), *(heads.means(other_SBN) for other_SBN, _ in fired[1:])]
         shape = outputs[0].shape
         task, version = parameters.task, self._version
 
@@ -202,7 +202,7 @@ class NativeNetwork:
                 raise RuntimeError("parameters have changed since the decision, expected its backward first")
             steps, grad_SBO = self._neurons.timesteps, grad.contiguous().view(shape)
             scale = 1.0 / steps if self._is_mean else 1.0
-            grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBO, scale)
+            grad_SBN, of_heads = self._heads.gradients(spikes_SBN, grad_SBO, scale, heads)
             grad_TBN = grad_SBN.expand(steps, -1, -1)
             grad_y, (grad_gain_N, grad_shift_N) = self._neurons.fire_backward(y_TBN, currents_4N, grad_TBN)
             if self._stream_norms:  # the gain scales the normalized current, and its constant shift
@@ -222,7 +222,7 @@ class NativeNetwork:
         """How the streams' currents come from their products: the gain, of the normalized product if that is set."""
         if not self._stream_norms:
             return Currents(parameters.gain_N)
-        norms, (task, gain_N, _) = self._stream_norms, parameters
+        norms, task, gain_N = self._stream_norms, parameters.task, parameters.gain_N
         # Copies: streams have statistics of their own, and moving those must not change what other inputs read.
         mean_N, variance_N = (
             torch.cat(parts) for parts in zip(*(norm.statistics(task) for norm in norms), strict=True)

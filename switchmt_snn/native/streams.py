@@ -94,50 +94,15 @@ class _Head(ctypes.Structure):
     )
 
 
-class Heads:
-    """The heads of all streams and the combination of their outputs, which is linear, as one matrix.
+class HeadMatrix(NamedTuple):
+    """All heads of a task and the combination of their outputs, which is linear, as one matrix."""
 
-    With quantiles, there is a second one of their means.
-
-    Attributes:
-        parameters: weight and bias of each head.
-    """
-
-    def __init__(self, network: QNetwork) -> None:
-        """Reads no parameter yet; see ``read``."""
-        layers = {name: cast(Stream, stream).head for name, stream in network.streams.items()}
-        self.parameters = tuple(part for layer in layers.values() for part in (layer.weight, layer.bias))
-        self._quantiles = network.config.quantiles
-        outputs = [layer.out_features // self._quantiles for layer in layers.values()]
-        units = torch.eye(sum(outputs)).split(outputs, dim=-1)
-        combination = network.combine(dict(zip(layers, units, strict=True))).contiguous()
-        self._combinations = combination.split(outputs)  # what a head's outputs of a quantile add to Q, [outputs, A]
-        neurons, actions = sum(layer.in_features for layer in layers.values()), combination.shape[1]
-        self._weight_ON = torch.empty(self._quantiles * actions, neurons)
-        self._bias_O = torch.empty(self._quantiles * actions)
-        self._mean = self._weight_ON, self._bias_O
-        self._heads = (_Head * len(layers))()
-        for head, layer, combination in zip(self._heads, layers.values(), self._combinations, strict=True):
-            head.combination = combination.data_ptr()
-            head.inputs, head.outputs = layer.in_features, len(combination)
-
-    def read(self) -> None:
-        """Make the matrix from the parameters as they are now.
-
-        Raises:
-            ValueError: they are not contiguous float32.
-        """
-        outputs, neurons = self._weight_ON.shape
-        quantiles, actions = self._quantiles, outputs // self._quantiles
-        for head, weight, bias in zip(self._heads, self.parameters[::2], self.parameters[1::2], strict=True):
-            head.weight = pointer(weight, FLOAT32, (quantiles * head.outputs, head.inputs))
-            head.bias = pointer(bias, FLOAT32, (quantiles * head.outputs,))
-        heads = ctypes.addressof(self._heads), len(self._heads)
-        combined = self._weight_ON.data_ptr(), self._bias_O.data_ptr()
-        library().snn_combine_heads(*heads, *combined, neurons, quantiles, actions)
-        if quantiles > 1:
-            shape = quantiles, actions
-            self._mean = self._weight_ON.unflatten(0, shape).mean(0), self._bias_O.unflatten(0, shape).mean(0)
+    task: int
+    weight_ON: Tensor
+    bias_O: Tensor
+    mean_weight_AN: Tensor
+    """Mean over quantiles; without quantiles ``weight_ON`` itself."""
+    mean_bias_A: Tensor
 
     def outputs(self, spikes_SBN: Tensor) -> Tensor:
         """``[S, B, O]`` for float32 spikes: values of all quantiles, if the heads are all that follows.
@@ -145,7 +110,7 @@ class Heads:
         Raises:
             ValueError: spikes are not contiguous float32 of all neurons.
         """
-        return _read_out(spikes_SBN, self._weight_ON, self._bias_O)
+        return _read_out(spikes_SBN, self.weight_ON, self.bias_O)
 
     def means(self, spikes_SBN: Tensor) -> Tensor:
         """``[S, B, A]``: as ``outputs``, the means over the quantiles.
@@ -153,23 +118,78 @@ class Heads:
         Raises:
             ValueError: spikes are not contiguous float32 of all neurons.
         """
-        return _read_out(spikes_SBN, *self._mean)
+        return _read_out(spikes_SBN, self.mean_weight_AN, self.mean_bias_A)
 
-    def gradients(self, spikes_SBN: Tensor, grad_SBO: Tensor, scale: float) -> tuple[Tensor, list[Tensor]]:
+
+class Heads:
+    """The heads of all streams.
+
+    Attributes:
+        parameters: weight and bias of each head.
+    """
+
+    def __init__(self, network: QNetwork) -> None:
+        """Reads no parameter yet; see ``of_task``."""
+        config, self._actions = network.config, network.observation.num_actions
+        layers = {name: cast(Stream, stream).head for name, stream in network.streams.items()}
+        self.parameters = tuple(part for layer in layers.values() for part in (layer.weight, layer.bias))
+        self._quantiles = config.quantiles
+        self._sets = network.observation.num_tasks if config.heads == "per_task" else 1
+        outputs = [layer.out_features // (self._quantiles * self._sets) for layer in layers.values()]
+        units = torch.eye(sum(outputs)).split(outputs, dim=-1)
+        combination = network.combine(dict(zip(layers, units, strict=True))).contiguous()
+        self._combinations = combination.split(outputs)  # what a head's outputs of a quantile add to Q, [outputs, A]
+        self._neurons = sum(layer.in_features for layer in layers.values())
+        self._heads = (_Head * len(layers))()
+        for head, layer, combination in zip(self._heads, layers.values(), self._combinations, strict=True):
+            head.combination = combination.data_ptr()
+            head.inputs, head.outputs = layer.in_features, len(combination)
+
+    def of_task(self, task: int) -> HeadMatrix:
+        """The matrix of a task, from the parameters as they are now.
+
+        Raises:
+            IndexError: unknown task.
+            ValueError: parameters are not contiguous float32.
+        """
+        quantiles, actions = self._quantiles, self._actions
+        for head, weight, bias in zip(self._heads, self.parameters[::2], self.parameters[1::2], strict=True):
+            rows = self._sets * quantiles * head.outputs
+            head.weight = pointer(weight, FLOAT32, (rows, head.inputs)) + self._offset(task, head) * head.inputs
+            head.bias = pointer(bias, FLOAT32, (rows,)) + self._offset(task, head)
+        weight_ON, bias_O = torch.empty(quantiles * actions, self._neurons), torch.empty(quantiles * actions)
+        heads = ctypes.addressof(self._heads), len(self._heads)
+        library().snn_combine_heads(*heads, weight_ON.data_ptr(), bias_O.data_ptr(), self._neurons, quantiles, actions)
+        means = (part if quantiles == 1 else part.unflatten(0, (quantiles, -1)).mean(0) for part in (weight_ON, bias_O))
+        return HeadMatrix(task, weight_ON, bias_O, *means)
+
+    def _offset(self, task: int, head: _Head) -> int:
+        """Bytes from the first bias of a head to that of a task."""
+        if self._sets == 1:
+            return 0
+        if not 0 <= task < self._sets:
+            raise IndexError(f"task {task}, expected 0 to {self._sets - 1}")
+        return task * self._quantiles * int(head.outputs) * 4
+
+    def gradients(
+        self, spikes_SBN: Tensor, grad_SBO: Tensor, scale: float, matrix: HeadMatrix
+    ) -> tuple[Tensor, list[Tensor]]:
         """Gradients of the spikes, times a scale, and of ``parameters``, from that of ``outputs``.
 
         Raises:
             ValueError: spikes or gradient are not contiguous float32 of all neurons or outputs.
         """
-        (outputs, neurons), rows = self._weight_ON.shape, spikes_SBN.shape[0] * spikes_SBN.shape[1]
-        grad_spikes, gradients = torch.empty_like(spikes_SBN), [torch.empty_like(part) for part in self.parameters]
+        rows, outputs = spikes_SBN.shape[0] * spikes_SBN.shape[1], len(matrix.bias_O)
+        make = torch.empty_like if self._sets == 1 else torch.zeros_like  # other tasks' rows have no gradient
+        grad_spikes, gradients = torch.empty_like(spikes_SBN), [make(part) for part in self.parameters]
         for head, weight, bias in zip(self._heads, gradients[::2], gradients[1::2], strict=True):
-            head.grad_weight, head.grad_bias = weight.data_ptr(), bias.data_ptr()
-        spikes = pointer(spikes_SBN, FLOAT32, (None, None, neurons))
+            offset = self._offset(matrix.task, head)
+            head.grad_weight, head.grad_bias = weight.data_ptr() + offset * head.inputs, bias.data_ptr() + offset
+        spikes = pointer(spikes_SBN, FLOAT32, (None, None, self._neurons))
         grad = pointer(grad_SBO, FLOAT32, (*spikes_SBN.shape[:2], outputs))
-        sizes = (rows, neurons, self._quantiles, outputs // self._quantiles, torch.get_num_threads())
+        sizes = (rows, self._neurons, self._quantiles, self._actions, torch.get_num_threads())
         heads = ctypes.addressof(self._heads), len(self._heads)
-        pointers = self._weight_ON.data_ptr(), spikes, grad
+        pointers = matrix.weight_ON.data_ptr(), spikes, grad
         library().snn_heads_backward(*heads, *pointers, scale, grad_spikes.data_ptr(), *sizes)
         return grad_spikes, gradients
 

@@ -16,6 +16,7 @@ from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.native import library as native_library
 from switchmt_snn.spiking.dendrites import ActiveDendrites
+from switchmt_snn.spiking.heads import TaskHeads
 from switchmt_snn.spiking.network import Convolution, QNetwork, Stream, TrunkLayer
 from switchmt_snn.spiking.neurons import LeakyLayer
 from switchmt_snn.spiking.normalization import FixedBatchNorm, TaskBatchNorm
@@ -31,6 +32,7 @@ _SETTINGS: dict[str, object] = {
     "readout": ("mean", "last_membrane", "max_membrane"),
     "readout_beta": _ANY,
     "quantiles": _ANY,
+    "heads": ("shared", "per_task"),
     "neuron": ("IF", "LIF"),
     "beta": _ANY,
     "alpha": _ANY,  # IF and LIF do not use these three
@@ -172,7 +174,7 @@ _STREAM_PARTS: dict[str, _Check] = {
     "normalization": lambda module: module is None or type(module) is FixedBatchNorm,
     "dendrites": lambda module: module is None or type(module) is ActiveDendrites,
     "neurons": _is_neurons,
-    "head": lambda module: type(module) is nn.Linear and module.bias is not None,
+    "head": lambda module: type(module) is TaskHeads or (type(module) is nn.Linear and module.bias is not None),
 }
 
 

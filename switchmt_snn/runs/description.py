@@ -47,7 +47,8 @@ class MethodDescription:
     """One of the seven methods under a config's other settings.
 
     Attributes:
-        deployed_parameters: of the network that decides and is exported; fewer than are trained with quantiles.
+        deployed_parameters: of the network that decides for one task; with quantiles or heads per task fewer than are
+            trained.
     """
 
     method: str

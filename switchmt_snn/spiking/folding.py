@@ -3,7 +3,7 @@
 BatchNorm (with a task's running statistics) and the dendritic gain of a task are affine maps of a layer's output
 channels, so a layer of task k is ``current = scale[k] * (W x) + shift[k]``, computed in float64. The two streams of a
 dueling network become one linear layer, channel after channel, and its head becomes ``[value | advantage minus its
-mean over actions]``: one plain chain with the same values. A head's quantiles become one output, their mean.
+mean over actions]``: one plain chain with the same values. ``switchmt_snn.spiking.folding_heads`` folds the heads.
 
 Every module is recognized by its exact type. An unknown one is refused by name and never left out.
 
@@ -26,6 +26,8 @@ from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ExportError, TaskError, did_you_mean
 from switchmt_snn.spiking.dendrites import ActiveDendrites
 from switchmt_snn.spiking.encodings import encoding_class
+from switchmt_snn.spiking.folding_heads import head_node, joined_heads
+from switchmt_snn.spiking.heads import TaskHeads
 from switchmt_snn.spiking.layers import (
     Array,
     Conv,
@@ -35,6 +37,7 @@ from switchmt_snn.spiking.layers import (
     Pair,
     ReadoutNode,
     SynapseNode,
+    TaskDense,
     convolved_sides,
     side_by_side,
 )
@@ -48,7 +51,7 @@ class StreamNodes:
     """One stream: a hidden layer and its own head."""
 
     hidden: Layer
-    head: Dense
+    head: Dense | TaskDense
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class FoldedNetwork:
     """
 
     layers: tuple[Layer, ...]
-    head: Dense
+    head: SynapseNode
     readout: ReadoutNode
     settings: NetworkConfig
     observation: ObservationSpec
@@ -125,7 +128,11 @@ class FoldedNetwork:
     def with_synapses(self, change: Callable[[SynapseNode], SynapseNode]) -> FoldedNetwork:
         """The same network with changed synapses, the head's too."""
         layers = tuple(replace(layer, synapses=change(layer.synapses)) for layer in self.layers)
-        return replace(self, layers=layers, head=cast(Dense, change(self.head)))
+        return replace(self, layers=layers, head=change(self.head))
+
+    def of_task(self, task: int) -> FoldedNetwork:
+        """The same network without the weights that only other tasks use."""
+        return self.with_synapses(lambda node: node.of_task(task))
 
 
 def fold(
@@ -333,8 +340,9 @@ def _stream(name: str, module: nn.Module, features: tuple[int, ...], quantiles: 
     """A stream's hidden layer, with the gains of its dendrites in scale and shift, and its head."""
     _require(module, Stream, name)
     stream = cast(Stream, module)
-    for part in ("synapses", "head"):
-        _require(getattr(stream, part), nn.Linear, f"{name}.{part}")
+    _require(stream.synapses, nn.Linear, f"{name}.synapses")
+    per_task = type(stream.head) is TaskHeads
+    _require(stream.head, TaskHeads if per_task else nn.Linear, f"{name}.head")
     hidden = _dense(f"{name}.hidden", stream.synapses, features, tasks)
     outputs = len(hidden.weight)
     if stream.normalization is not None:
@@ -348,20 +356,11 @@ def _stream(name: str, module: nn.Module, features: tuple[int, ...], quantiles: 
     if stream.k_winners is not None and stream.k_winners < outputs:
         hidden = replace(hidden, k_winners=stream.k_winners)
     neurons = _neurons(stream.neurons, outputs, name)
-    return StreamNodes(Layer(hidden, neurons), _mean_head(name, stream, hidden.output_shape, quantiles, tasks))
+    rows = _dense(f"{name}.head", stream.head, hidden.output_shape, tasks)
+    return StreamNodes(Layer(hidden, neurons), head_node(rows, quantiles, per_task))
 
 
-def _mean_head(name: str, stream: Stream, features: tuple[int, ...], quantiles: int, tasks: range) -> Dense:
-    """A stream's head. The mean over quantiles is linear, so their rows and biases become their means."""
-    head = _dense(f"{name}.head", stream.head, features, tasks)
-    if quantiles == 1:
-        return head
-    weight = head.weight.reshape(quantiles, -1, *features).mean(axis=0)
-    shift_KO = head.shift_KO.reshape(len(tasks), quantiles, -1).mean(axis=1)
-    return replace(head, weight=weight, scale_KO=np.ones_like(shift_KO), shift_KO=shift_KO, output_shape=(len(weight),))
-
-
-def _joined(streams: dict[str, StreamNodes]) -> tuple[Layer, Dense]:
+def _joined(streams: dict[str, StreamNodes]) -> tuple[Layer, Dense | TaskDense]:
     """The hidden layers of all streams as one, and their heads as one."""
     parts = [cast(Dense, stream.hidden.synapses) for stream in streams.values()]
     first = parts[0]
@@ -379,18 +378,4 @@ def _joined(streams: dict[str, StreamNodes]) -> tuple[Layer, Dense]:
         gated=first.gated,
     )
     neurons = side_by_side([stream.hidden.neurons for stream in streams.values()])
-    heads = {name: stream.head for name, stream in streams.items()}
-    return Layer(hidden, neurons), replace(_head(heads), name="head", input_shape=hidden.output_shape)
-
-
-def _head(heads: dict[str, Dense]) -> Dense:
-    """Q = q(h), or V(h) + A(h) - mean over actions of A(h) as one linear map of ``[h_value, h_advantage]``."""
-    if heads.keys() == {"q"}:
-        return heads["q"]
-    if heads.keys() != {"value", "advantage"}:
-        raise ExportError(f"the streams are {', '.join(heads)}, expected q, or value and advantage")
-    value, advantage = heads["value"], heads["advantage"]
-    shared = np.repeat(value.weight, len(advantage.weight), axis=0)
-    weight = np.concatenate([shared, advantage.weight - advantage.weight.mean(axis=0)], axis=1)
-    shift_KO = value.shift_KO + advantage.shift_KO - advantage.shift_KO.mean(axis=1, keepdims=True)
-    return replace(advantage, weight=weight, shift_KO=shift_KO)
+    return Layer(hidden, neurons), joined_heads({name: stream.head for name, stream in streams.items()})

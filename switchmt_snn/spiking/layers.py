@@ -5,6 +5,7 @@ node         equation
 ===========  =========================================================================================
 Conv         ``current = scale_KO[k] * (W * x) + shift_KO[k]``, ``*`` the cross-correlation of images
 Dense        ``current = scale_KO[k] * (W x) + shift_KO[k]``, then k winners per group if it has them
+TaskDense    ``current = scale_KO[k] * (W_k x) + shift_KO[k]``, a matrix of its own for each task k
 ReadoutNode  Q-values from the head's outputs at the T steps
 ===========  =========================================================================================
 
@@ -88,6 +89,10 @@ class SynapseNode:
         """Products of one pass in which every weight meets every input that it reaches; padding is not counted."""
         raise NotImplementedError(f"{type(self).__name__} does not count its operations, expected a number")
 
+    def of_task(self, task: int) -> SynapseNode:
+        """The synapses of a network that serves one task; other tasks' weights are left out."""
+        return self
+
     def over_weight(self, values_O: Array) -> Array:
         """Values per output channel, shaped to broadcast over ``weight``."""
         return values_O.reshape(-1, *(1,) * (self.weight.ndim - 1))
@@ -152,10 +157,55 @@ class Dense(SynapseNode):
         """``Linear``."""
         return "Linear"
 
+    def of_task(self, task: int) -> Dense:
+        """Itself: its weights serve all tasks."""
+        return self
+
     @property
     def dense_operations(self) -> int:
         """Every weight meets one input."""
         return self.weight.size
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskDense(SynapseNode):
+    """A linear map for each task, of which a decision computes one: ``y[o] = sum over i of weight[k O + o, i] x[i]``.
+
+    Attributes:
+        weight: ``[K * O, I]``, the rows of a task side by side; ``weight_steps_O`` has as many entries.
+    """
+
+    @property
+    def kind(self) -> str:
+        """``Linear per task``."""
+        return "Linear per task"
+
+    @property
+    def depends_on_task(self) -> bool:
+        """Always."""
+        return True
+
+    @property
+    def dense_operations(self) -> int:
+        """Every weight of a task meets one input."""
+        return self.weight.size // len(self.shift_KO)
+
+    def of_task(self, task: int) -> Dense:
+        """A task's own rows."""
+        rows = slice(task * self.outputs, (task + 1) * self.outputs)
+        return Dense(
+            name=self.name,
+            weight=self.weight[rows],
+            scale_KO=self.scale_KO,
+            shift_KO=self.shift_KO,
+            input_shape=self.input_shape,
+            output_shape=self.output_shape,
+            weight_steps_O=None if self.weight_steps_O is None else self.weight_steps_O[rows],
+        )
+
+    def folded(self, task: int) -> tuple[Float, Float]:
+        """As that of the task's own rows."""
+        return self.of_task(task).folded(task)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ Shapes: T simulation steps, B batch, C channels, H W image, K tasks, A actions, 
     dueling: Q = V + A - mean_a(A), a stream for each
 
 With M quantiles, a head has M sets of its outputs, one set after the other; each set gives one quantile of all actions,
-and Q is the mean over the sets.
+and Q is the mean over the sets. With heads per task, each task has rows of its own in the last linear layer.
 
 Stateless layers see time folded into the batch ``[T*B, ...]``; only neurons walk over T. Under direct encoding the
 first layer and its BatchNorm are computed once, since every step has the same input. The head is linear, so for the
@@ -29,8 +29,9 @@ from torch import Tensor, nn
 
 from switchmt_snn.config import METHOD_TRAITS, NetworkConfig
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.spiking.dendrites import keep_k_winners, make_dendrites
+from switchmt_snn.spiking.dendrites import ActiveDendrites, keep_k_winners, make_dendrites
 from switchmt_snn.spiking.encodings import make_encoding
+from switchmt_snn.spiking.heads import TaskHeads, make_head
 from switchmt_snn.spiking.neurons import NeuronLayer, NeuronState, make_neuron_layer
 from switchmt_snn.spiking.normalization import TaskBatchNorm, make_mlp_normalization, make_stream_normalization
 from switchmt_snn.spiking.readout import make_readout
@@ -47,8 +48,8 @@ State = dict[str, NeuronState]
 """State variables of each layer's neurons (``NeuronLayer.STATE``) by layer name; an empty dict is the resting state."""
 
 Context = dict[str, tuple[Tensor, ...]]
-"""All that tells a network its task, by layer name: BatchNorm's running mean and variance ``[C]``, or the dendrites'
-index ``[1]``."""
+"""All that tells a network its task, by layer name: BatchNorm's running mean and variance ``[C]``, and the task's index
+``[1]``."""
 
 
 @dataclass(frozen=True)
@@ -127,12 +128,16 @@ class Stream(nn.Module):
         self.dendrites = make_dendrites(config, hidden, num_tasks)
         self.k_winners = config.k_winners
         self.neurons = make_neuron_layer(config, spiking)
-        self.head = nn.Linear(hidden, config.quantiles * num_outputs)
+        self.head = make_head(config, hidden, config.quantiles * num_outputs, num_tasks)
 
     def context(self, task: int) -> tuple[Tensor, ...]:
-        """The running mean and variance ``[N]`` with normalization, then the dendrites' index of a task ``[1]``."""
+        """The running mean and variance ``[N]`` with normalization, then a task's index ``[1]`` with dendrites or heads
+        per task."""
         statistics = () if self.normalization is None else self.normalization.statistics(task)
-        return statistics if self.dendrites is None else (*statistics, self.dendrites.index(task))
+        for part in (self.dendrites, self.head):
+            if isinstance(part, (ActiveDendrites, TaskHeads)):
+                return (*statistics, part.index(task))
+        return statistics
 
     def current(
         self, x_TBN: Tensor, context: tuple[Tensor, ...], precision: torch.dtype | None, training: bool
@@ -147,6 +152,12 @@ class Stream(nn.Module):
         if self.k_winners is not None:
             current_TBN = keep_k_winners(current_TBN, self.k_winners)
         return current_TBN
+
+    def outputs(self, spikes: Tensor, context: tuple[Tensor, ...]) -> Tensor:
+        """The head's outputs ``[..., O]`` for hidden spikes ``[..., N]``."""
+        if isinstance(self.head, TaskHeads):
+            return self.head.of_task(spikes, context[-1])
+        return cast(Tensor, self.head(spikes))
 
 
 class QNetwork(nn.Module):
@@ -326,7 +337,7 @@ class QNetwork(nn.Module):
     ) -> Tensor:
         current_TBN = stream.current(features_TBN, context, precision, training)
         spikes_TBN = self._fire(name, stream, current_TBN, state, activity)
-        outputs = self.readout.stream(stream.head, spikes_TBN)
+        outputs = self.readout.stream(lambda spikes: stream.outputs(spikes, context), spikes_TBN)
         return outputs if self.config.quantiles == 1 else outputs.unflatten(-1, (self.config.quantiles, -1))
 
     def combine(self, outputs: dict[str, Tensor]) -> Tensor:
@@ -353,6 +364,7 @@ def trainable_parameters(network: nn.Module) -> int:
 
 
 def deployed_parameters(network: QNetwork) -> int:
-    """Parameters of the network that decides: of a head's quantiles, only their mean."""
+    """Parameters of the network that decides for a task: of the heads, the task's own, and only the quantiles' mean."""
     heads = sum(trainable_parameters(cast(Stream, stream).head) for stream in network.streams.values())
-    return trainable_parameters(network) - heads + heads // network.config.quantiles
+    sets = network.observation.num_tasks if network.config.heads == "per_task" else 1
+    return trainable_parameters(network) - heads + heads // (sets * network.config.quantiles)

@@ -14,10 +14,10 @@ neurons that never fire: ``M(t) = beta M(t-1) + y(t)``, ``M(0) = 0``.
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Callable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.spiking.settings import require_known
@@ -30,7 +30,7 @@ class Readout:
         """``beta`` is the decay of M per simulation step."""
         self.beta = beta
 
-    def stream(self, head: nn.Module, spikes_TBN: Tensor) -> Tensor:
+    def stream(self, head: Callable[[Tensor], Tensor], spikes_TBN: Tensor) -> Tensor:
         """Outputs of one stream, ``[B, O]`` or ``[T, B, O]``, for its hidden spikes."""
         return self.integrate(head(spikes_TBN))
 
@@ -46,9 +46,9 @@ class Readout:
 class Mean(Readout):
     """Mean over T. The head is linear, so it is applied once, to the mean spikes."""
 
-    def stream(self, head: nn.Module, spikes_TBN: Tensor) -> Tensor:
+    def stream(self, head: Callable[[Tensor], Tensor], spikes_TBN: Tensor) -> Tensor:
         """``[B, O]``."""
-        return cast(Tensor, head(spikes_TBN.mean(0)))
+        return head(spikes_TBN.mean(0))
 
     def integrate(self, outputs_TBO: Tensor) -> Tensor:
         """``[B, O]``."""

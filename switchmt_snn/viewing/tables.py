@@ -228,7 +228,7 @@ def layers_table(method: MethodDescription) -> Table:
     )
     if method.deployed_parameters != method.trainable_parameters:
         trained, deployed = method.trainable_parameters, method.deployed_parameters
-        parts += f"; {trained:,} parameters are trained, {deployed:,} decide and are exported"
+        parts += f"; {trained:,} parameters are trained, {deployed:,} decide for a task"
     table = _table(f"Layers of {method.method}", parts)
     _add_columns(table, ("layer",), ("input", "output", "parameters", "neurons", "ops/step", "steps"))
     for layer in method.layers:

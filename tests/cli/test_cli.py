@@ -71,6 +71,10 @@ def test_describe_names_trained_and_deployed_parameters(capsys) -> None:
         assert sum(layer["parameters"] for layer in facts["layers"]) == facts["trainable_parameters"]
     _, out, _ = call(capsys, *flags)
     assert "3,602,514 parameters are trained, 3,300,357 decide" in " ".join(out.split())
+    _, out, _ = call(capsys, "describe", "--network.heads", "per_task", "--json")
+    facts = json.loads(out)["methods"]["SwitchMT"]
+    assert facts["trainable_parameters"] == TABLE_3["SwitchMT"] + 19_494
+    assert facts["deployed_parameters"] == TABLE_3["SwitchMT"]
     _, out, _ = call(capsys, "describe")
     assert "are trained" not in out
 

@@ -83,15 +83,16 @@ def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:
     neuron=st.sampled_from(list(NEURONS)),
     readout=st.sampled_from(list(READOUTS)),
     quantiles=st.sampled_from([1, 1, 3, 4]),
+    heads=st.sampled_from(["shared", "per_task"]),
     normalization=st.sampled_from(["per_task", "shared"]),
     seed=st.integers(0, 2**20),
 )
 def test_any_network_is_exported_bitwise(
-    method, reset, timesteps, dendrites, encoding, neuron, readout, quantiles, normalization, seed
+    method, reset, timesteps, dendrites, encoding, neuron, readout, quantiles, heads, normalization, seed
 ) -> None:
     """On exact numbers, whatever the combination; EXPORT_EXAMPLES=500 looks at more of them."""
     traits = METHOD_TRAITS[method]
-    network = {"method": method, "timesteps": timesteps, "normalization": normalization}
+    network = {"method": method, "timesteps": timesteps, "normalization": normalization, "heads": heads}
     if traits.spiking:
         network |= {"reset": reset, "encoding": encoding, "neuron": neuron, "readout": readout}
         network["tasks"] = {"frame_stack": ENCODINGS[encoding].steps(timesteps) or 2}
@@ -156,14 +157,15 @@ def test_a_broken_export_is_caught_and_the_layer_named() -> None:
             assert comparison.first_difference == name
 
 
-@pytest.mark.parametrize("variant", ["SwitchMT", "DQN_D", "LIF"])
+@pytest.mark.parametrize("variant", ["SwitchMT", "DQN_D", "LIF", "heads per task"])
 @pytest.mark.parametrize("task", [None, 2])
 def test_int8_weights_are_stored_as_integers_and_mean_the_rounded_ones(variant: str, task: int | None) -> None:
     agent = make_agent(**VARIANTS[variant])
     network = quantized(fold_agent(agent))
     model = decision_model(network, task)
     stored = {t.name: onnx.numpy_helper.to_array(t) for t in model.graph.initializer}
-    for node, original in zip(network.synapses, fold_agent(agent).synapses, strict=True):
+    networks = [part if task is None else part.of_task(task) for part in (network, fold_agent(agent))]
+    for node, original in zip(*(part.synapses for part in networks), strict=True):
         integers = stored[f"{node.name}_weight_int8"]
         assert integers.dtype == np.int8
         assert np.abs(integers).max() == 127

@@ -173,12 +173,12 @@ def test_state_dict_continues_exactly(policy: str) -> None:
     assert_continues_exactly(lambda: counting(config), at_steps=(3, 33, 150, 271))
 
 
-def contradiction(method: str, dendrites: str, seed: int) -> float:
+def contradiction(method: str, dendrites: str, seed: int, heads: str = "shared") -> float:
     """Share of right actions after training on two tasks with one observation and opposite right actions."""
     config = small_config(
         seed=seed,
         total_steps=2500,
-        network={"method": method, "dendrites": dendrites, "timesteps": 4, "hidden_units": 32},
+        network={"method": method, "dendrites": dendrites, "timesteps": 4, "hidden_units": 32, "heads": heads},
         learning={"epsilon_decay_steps": 1000, "update_every_steps": 2, "discount": 0.0, "batch_size": 16},
         switching={"policy": "fixed_episodes", "visit_episodes": 25},
     )
@@ -201,6 +201,13 @@ def test_contradicting_tasks_are_solved_with_dendrites(dendrites: str, seed: int
 @pytest.mark.parametrize("method", ["DSQN", "DSQN_D", "DQN_D"])
 def test_contradicting_tasks_stay_at_chance_without_dendrites(method: str, seed: int) -> None:
     assert contradiction(method, "auto", seed) == 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("method", ["DSQN_D", "DQN_D"])
+def test_contradicting_tasks_are_solved_with_heads_per_task(method: str, seed: int) -> None:
+    assert contradiction(method, "auto", seed, heads="per_task") == 1.0
 
 
 @pytest.mark.slow

@@ -150,7 +150,8 @@ def test_panels_refuse_what_are_no_words(words: Tensor) -> None:
 )
 def test_heads_refuse_other_spikes(spikes: Tensor) -> None:
     heads = Heads(network_of())
-    for action in (lambda: heads.outputs(spikes), lambda: heads.gradients(spikes, torch.zeros(1, 4, 6), 1.0)):
+    matrix = heads.of_task(0)
+    for action in (lambda: matrix.outputs(spikes), lambda: heads.gradients(spikes, torch.zeros(1, 4, 6), 1.0, matrix)):
         with pytest.raises(ValueError, match=r"expected contiguous float32 \[\*, \*, 74\]"):
             action()
 
@@ -158,8 +159,9 @@ def test_heads_refuse_other_spikes(spikes: Tensor) -> None:
 @builds
 @pytest.mark.parametrize("grad", [torch.zeros(1, 4, 7), torch.zeros(1, 3, 6), torch.zeros(1, 4, 6).double()])
 def test_heads_refuse_other_gradients(grad: Tensor) -> None:
+    heads = Heads(network_of())
     with pytest.raises(ValueError, match=r"expected contiguous float32 \[1, 4, 6\]"):
-        Heads(network_of()).gradients(torch.zeros(1, 4, 74), grad, 1.0)
+        heads.gradients(torch.zeros(1, 4, 74), grad, 1.0, heads.of_task(0))
 
 
 @builds

@@ -48,24 +48,37 @@ def test_a_stream_without_dendrites_has_gains_of_one() -> None:
     ("steps", "batch", "actions", "quantiles"),
     [(1, 32, 6, 1), (4, 3, 18, 1), (2, 5, 1, 1), (1, 11, 6, 4), (2, 2, 18, 32)],
 )
-def test_heads_are_those_of_the_network(method: str, steps: int, batch: int, actions: int, quantiles: int) -> None:
-    network = network_of(actions, method=method, quantiles=quantiles)
+@pytest.mark.parametrize("own", ["shared", "per_task"])
+def test_heads_are_those_of_the_network(
+    method: str, steps: int, batch: int, actions: int, quantiles: int, own: str
+) -> None:
+    network = network_of(actions, method=method, quantiles=quantiles, heads=own)
     streams, heads = streams_of(network), Heads(network)
     spikes = (torch.rand(steps, batch, 37 * len(streams)) < 0.4).float()
-    for _ in range(2):  # the second time with other parameters
-        heads.read()
+    for task in (0, 2):  # the second time with other parameters
+        matrix = heads.of_task(task)
         x = spikes.clone().requires_grad_()
         parts = zip(network.streams, streams, x.split(37, dim=-1), strict=True)
-        outputs = {name: stream.head(part).unflatten(-1, (quantiles, -1)) for name, stream, part in parts}
+        outputs = {
+            name: stream.outputs(part, stream.context(task)).unflatten(-1, (quantiles, -1))
+            for name, stream, part in parts
+        }
         values = network.combine(outputs)  # [S, B, M, A]
-        torch.testing.assert_close(heads.means(spikes), values.detach().mean(2), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(matrix.means(spikes), values.detach().mean(2), rtol=1e-4, atol=1e-5)
         theirs = values.flatten(2)
-        torch.testing.assert_close(heads.outputs(spikes), theirs.detach(), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(matrix.outputs(spikes), theirs.detach(), rtol=1e-4, atol=1e-5)
         weights = torch.randn(theirs.shape) * (torch.rand(theirs.shape) < 0.5)  # some outputs without a gradient
         their_gradients = torch.autograd.grad((theirs * weights).sum(), [x, *heads.parameters])
-        ours, of_heads = heads.gradients(spikes, weights, 0.25)
+        ours, of_heads = heads.gradients(spikes, weights, 0.25, matrix)
         for our, their in zip((ours * 4, *of_heads), their_gradients, strict=True):
-            torch.testing.assert_close(our, their, rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(our, their, rtol=1e-4, atol=1e-4)
         with torch.no_grad():
             for part in heads.parameters:
                 part.normal_()
+
+
+def test_heads_of_an_unknown_task_are_refused() -> None:
+    heads = Heads(network_of(method="DSQN_D", heads="per_task"))
+    for task in (-1, 3):
+        with pytest.raises(IndexError, match=f"task {task}, expected 0 to 2"):
+            heads.of_task(task)

@@ -47,11 +47,11 @@ def neurons() -> Call:
 
 def heads() -> Call:
     layer, spikes, grad = Heads(network_of()), torch.rand(3, 40, 74), torch.randn(3, 40, 6)
-    layer.read()
+    matrix = layer.of_task(0)
 
     def call() -> tuple[Tensor, ...]:
-        grad_spikes, of_heads = layer.gradients(spikes, grad, 1.0)
-        return layer.outputs(spikes), grad_spikes, *of_heads
+        grad_spikes, of_heads = layer.gradients(spikes, grad, 1.0, matrix)
+        return matrix.outputs(spikes), grad_spikes, *of_heads
 
     return call
 

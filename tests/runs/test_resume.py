@@ -146,7 +146,7 @@ def test_killed_at_random_moments_ends_bitwise_the_same(config: Path, whole: Pat
     [
         ("compiled", ()),
         ("native", ()),
-        ("native", ("--network.quantiles", "4", "--learning.loss", "huber")),
+        ("native", ("--network.quantiles", "4", "--learning.loss", "huber", "--network.heads", "per_task")),
     ],
 )
 def test_a_compiled_run_continues_exactly_in_another_process(

@@ -21,7 +21,7 @@ SIZE = 12
 
 
 def config() -> ExperimentConfig:
-    """A convolution with BatchNorm, dendrites, and quantiles; gradients are clipped by norm."""
+    """A convolution with BatchNorm, dendrites, quantiles and heads per task; gradients are clipped by norm."""
     return small_config(
         tasks={"suite": "minatar", "names": ["breakout", "asterix"]},
         network={
@@ -31,6 +31,7 @@ def config() -> ExperimentConfig:
             "threshold": 0.5,
             "dendrites": "per_neuron",
             "quantiles": 3,
+            "heads": "per_task",
         },
         learning={"batch_size": SIZE, "gradient_clip": "norm", "gradient_clip_at": 0.05, "loss": "huber"},
     )

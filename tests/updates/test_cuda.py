@@ -30,7 +30,7 @@ FORMS: list[dict[str, Any]] = [
     {"learning": {"gradient_clip": "value", "double_q": False}},
     {"network": {"encoding": "rate", "neuron": "LIF", "learn_beta": True}},
     {"network": {"method": "DQN_D"}},
-    {"network": {"quantiles": 4}, "learning": {"loss": "huber"}},
+    {"network": {"quantiles": 4, "heads": "per_task"}, "learning": {"loss": "huber"}},
 ]
 
 

@@ -89,8 +89,10 @@ builds = pytest.mark.skipif(not ENGINES["native"].status().startswith("works"), 
         {"encoding": "rate", "surrogate": "sigmoid", "readout": "max_membrane", "k_winners": 5},
         {"method": "DQN_D"},
         {"quantiles": 4},
+        {"heads": "per_task", "threshold": 0.3},
+        {"heads": "per_task", "method": "DSQN_D", "quantiles": 3, "threshold": 0.3},
     ],
-    ids=["default", "LIF-subtract", "rate", "ANN", "quantiles"],
+    ids=["default", "LIF-subtract", "rate", "ANN", "quantiles", "heads", "heads-quantiles"],
 )
 def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
     _compare_to_rounding("compiled", network)
@@ -115,6 +117,8 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
         {"trunk": "nature", "threshold": 0.5},
         {"quantiles": 4},
         {"quantiles": 3, "readout": "last_membrane", "method": "DSQN"},
+        {"heads": "per_task", "threshold": 0.3},
+        {"heads": "per_task", "method": "DSQN_D", "quantiles": 3, "threshold": 0.3},
     ],
     ids=[
         "default",
@@ -126,6 +130,8 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
         "nature",
         "quantiles",
         "quantiles-last",
+        "heads",
+        "heads-quantiles",
     ],
 )
 def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any]) -> None:
@@ -135,7 +141,16 @@ def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any])
 @builds
 @pytest.mark.parametrize("copies", [1, 8, 40])  # 40: more lanes than a panel of few
 @pytest.mark.parametrize(
-    "network", [{}, OTHER_NEURONS, {"readout": "max_membrane"}, {"trunk": "nature"}, {"trunk": "mlp"}, {"quantiles": 5}]
+    "network",
+    [
+        {},
+        OTHER_NEURONS,
+        {"readout": "max_membrane"},
+        {"trunk": "nature"},
+        {"trunk": "mlp"},
+        {"quantiles": 5},
+        {"heads": "per_task", "threshold": 0.3},
+    ],
 )
 def test_native_decisions_are_the_eager_ones_to_rounding(network: dict[str, Any], copies: int) -> None:
     """Also after an update has changed the weights."""
