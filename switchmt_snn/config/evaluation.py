@@ -21,6 +21,9 @@ class EvaluationConfig:
     """Episodes played side by side."""
     every_steps: int | None = None
     """Also evaluate during training, every so many steps; null only at its end."""
+    stop_at_returns: tuple[float, ...] = ()
+    """End training when an evaluation during training reaches these mean returns, one per task (CartPole-v1 counts as
+    solved at 475). The final evaluation then plays other episodes (seed + 1). Empty: train for total_steps."""
 
     def __post_init__(self) -> None:
         check_fields(self, "evaluation")
@@ -29,6 +32,14 @@ class EvaluationConfig:
         require(self.seed >= 0, "evaluation.seed", self.seed, "at least 0")
         require(self.num_envs >= 1, "evaluation.num_envs", self.num_envs, "at least 1")
         require(self.every_steps is None or self.every_steps >= 1, "evaluation.every_steps", self.every_steps, ">= 1")
+        if self.stop_at_returns:
+            require(
+                self.every_steps is not None,
+                "evaluation.every_steps",
+                self.every_steps,
+                "a number of steps with evaluation.stop_at_returns",
+                "training ends at one of its evaluations",
+            )
 
 
 @dataclass(frozen=True)

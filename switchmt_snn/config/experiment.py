@@ -54,6 +54,13 @@ class ExperimentConfig:
             self.learning.loss,
             f"huber with network.quantiles={self.network.quantiles}",
         )
+        goals, names = self.evaluation.stop_at_returns, self.tasks.names
+        require(
+            len(goals) in (0, len(names)),
+            "evaluation.stop_at_returns",
+            list(goals),
+            f"a return for each of {list(names)}",
+        )
         stack = resolved_frame_stack(self.tasks)
         per_env = self.learning.replay_capacity_steps // self.tasks.num_envs
         require(

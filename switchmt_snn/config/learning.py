@@ -43,7 +43,8 @@ class LearningConfig:
     engine: Literal["auto"] | Engine = "auto"
     """How updates are executed. eager: PyTorch. native: C++ (CPU only, compiled once in about 7 s). compiled:
     torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for Atari-size
-    networks if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or more; else eager."""
+    networks and long runs on vectors, if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or
+    more; else eager."""
     acting: Literal["auto", "eager", "native"] = "auto"
     """Who computes the actions of training. eager: PyTorch in float32. native: the native engine, in the precision of
     its updates. Evaluation is always eager. auto: native with engine native, else eager."""

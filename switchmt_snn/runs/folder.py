@@ -16,7 +16,7 @@ from typing import Any
 import filelock
 
 from switchmt_snn.acting.evaluation import Evaluation
-from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
+from switchmt_snn.config import EvaluationConfig, ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.files import file_name, write_atomically
@@ -153,6 +153,15 @@ class RunFolder:
     def has_evaluation(self, step: int) -> bool:
         """Whether the weights of this step were evaluated."""
         return any((self.path / "evaluations").glob(f"{_evaluation_stem(step)}_*.json"))
+
+    def mean_returns(self, step: int, settings: EvaluationConfig) -> dict[str, float]:
+        """Mean return of the agent by task, from an evaluation of this step's weights; empty if it was not made."""
+        name = f"{_evaluation_stem(step)}_*_n{settings.episodes}_seed{settings.seed}.json"
+        means: dict[str, float] = {}
+        for path in sorted((self.path / "evaluations").glob(name)):
+            rows = json.loads(path.read_text())["tasks"]
+            means |= {row["task"]: float(row["mean"]) for row in rows if row["policy"] == "agent"}
+        return means
 
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""

@@ -16,7 +16,7 @@ import torch
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
-from switchmt_snn.config import ExperimentConfig, from_dict, load_config, to_dict
+from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, load_config, to_dict
 from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.events import Event, Stepped
@@ -183,13 +183,19 @@ class _Driver:
         self.config = training.config
         self.store = folder.checkpoints(self.config.recording.keep_checkpoints)
         self.logs: RunLogs | None = None
+        self.solved = False
 
     def run(self) -> RunResult:
         """Continue or begin, to the budget or to a stop."""
         training, config = self.training, self.config
         log_sizes, resumed_at, notes = self._restore()
-        finished = resumed_at is not None and training.steps >= config.total_steps
-        if finished and self.folder.has_evaluation(training.steps):
+        if resumed_at is not None:
+            self.solved = self._is_solved(self.folder.mean_returns(resumed_at, config.evaluation))
+        if self.solved:
+            evaluated = bool(self.folder.mean_returns(training.steps, self._final_evaluation()))
+        else:
+            evaluated = training.steps >= config.total_steps and self.folder.has_evaluation(training.steps)
+        if evaluated:
             return RunResult(self.folder.path, "already_finished", training.steps, None)
         try:
             return self._run(log_sizes, resumed_at, [*self.notes, *notes])
@@ -210,12 +216,15 @@ class _Driver:
         stopped = False
         try:
             with _stop_requests() as requested:
-                for event in training.events():
+                for event in () if self.solved else training.events():
                     logs(event)
                     for observer in self.observers:
                         observer(event)
                     if isinstance(event, Stepped):
                         self._record(event.step)
+                        if self.solved:
+                            self._note(f"evaluation.stop_at_returns is reached at step {event.step:,}: training ends")
+                            break
                         if requested():
                             stopped = training.steps < self.config.total_steps
                             break
@@ -226,7 +235,7 @@ class _Driver:
                 observer.stop()
         if stopped:
             return RunResult(path, "stopped", training.steps, None)
-        return RunResult(path, "finished", training.steps, self._evaluate())
+        return RunResult(path, "finished", training.steps, self._evaluate(self._final_evaluation()))
 
     def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
         """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""
@@ -247,9 +256,10 @@ class _Driver:
         before = step - self.training.num_envs
         every = self.config.evaluation.every_steps
         if every is not None and step // every > before // every and step < self.config.total_steps:
-            self._evaluate()
+            evaluation = self._evaluate(self.config.evaluation)
+            self.solved = self._is_solved({row.task: row.mean for row in evaluation.tasks if row.policy == "agent"})
         every = self.config.recording.checkpoint_every_steps
-        if step // every > before // every and step < self.config.total_steps:
+        if step // every > before // every and step < self.config.total_steps and not self.solved:
             self._save()
 
     def _save(self) -> None:
@@ -273,10 +283,23 @@ class _Driver:
             rises.append((np.mean(newest) - np.mean(first)) / max(1.0, float(np.std(first))))
         return float(np.mean(rises))
 
-    def _evaluate(self) -> Evaluation:
+    def _is_solved(self, means: dict[str, float]) -> bool:
+        """Whether an evaluation's mean returns by task reach ``evaluation.stop_at_returns``."""
+        goals = self.config.evaluation.stop_at_returns
+        names = self.training.suite.names
+        return bool(goals) and all(
+            name in means and means[name] >= goal for name, goal in zip(names, goals, strict=True)
+        )
+
+    def _final_evaluation(self) -> EvaluationConfig:
+        """The last evaluation's settings: other episodes than those that chose when to stop."""
+        evaluation = self.config.evaluation
+        return replace(evaluation, seed=evaluation.seed + 1) if self.solved else evaluation
+
+    def _evaluate(self, settings: EvaluationConfig) -> Evaluation:
         training = self.training
         agent = Agent(training.learner.network, training.suite, self.config, training.learner.device, training.steps)
-        protocol = EvaluationProtocol.of(self.config.evaluation, self.config.tasks)
+        protocol = EvaluationProtocol.of(settings, self.config.tasks)
         self._note(f"evaluating: {protocol}")
         evaluation = evaluate_agent(agent, protocol)
         self.folder.save_evaluation(evaluation)

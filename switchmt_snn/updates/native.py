@@ -13,7 +13,11 @@ from torch import Tensor
 
 from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig, LearningConfig
 from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.updates.compiled import planned_updates
 from switchmt_snn.updates.protocol import Engine, Values
+
+BUILD_FROM_UPDATES = 5_000
+"""Updates of a small network that are worth building the C++ code (some 7 s, once per machine)."""
 
 
 class Native(Engine):
@@ -49,10 +53,12 @@ class Native(Engine):
     @classmethod
     def pays(cls, config: ExperimentConfig, device: torch.device, precision: str) -> bool:
         """On the nature trunk it is the fastest engine (docs/performance.md) if its products of spikes are sums over
-        bits, or the other products are bfloat16. MinAtar's small network is faster compiled.
+        bits, or the other products are bfloat16. On the mlp trunk it takes about half of eager's time, which pays for
+        building it in runs of some thousand updates. MinAtar's small network is faster compiled.
         """
         spiking = METHOD_TRAITS[config.network.method].spiking
-        if device.type != "cpu" or config.network.trunk != "nature" or not spiking:
+        trunk, is_short = config.network.trunk, planned_updates(config) < BUILD_FROM_UPDATES
+        if device.type != "cpu" or not spiking or trunk == "minatar" or (trunk == "mlp" and is_short):
             return False
         supports = _supports()
         if precision == "bfloat16" or supports is None or supports.problem() is not None:

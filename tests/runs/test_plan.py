@@ -95,7 +95,7 @@ def test_native_acting_needs_the_native_engine() -> None:
 @compiles
 def test_auto_compiles_long_runs_only_and_says_so() -> None:
     short, no_notes = decided(small_config())
-    long, notes = decided(small_config(total_steps=LONG))
+    long, notes = decided(small_config(total_steps=LONG, network={"method": "DQN_D"}))
     assert (short.learning.engine, no_notes) == ("eager", ())
     assert long.learning.engine == "compiled"
     assert len(notes) == 1
@@ -108,7 +108,7 @@ def test_auto_compiles_long_runs_only_and_says_so() -> None:
 
 def test_without_a_compiler_auto_says_so_and_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, "compile_problem", lambda: "no g++")
-    config, notes = decided(small_config(total_steps=LONG))
+    config, notes = decided(small_config(total_steps=LONG, network={"method": "DQN_D"}))
     assert config.learning.engine == "eager"
     assert "compiled engine: torch.compile fails on this machine (no g++)" in notes[0]
     with pytest.raises(ConfigError, match=r"learning\.engine is 'compiled'.*no g\+\+.*eager"):
