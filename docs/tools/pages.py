@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from docs.tools.cartpole_page import cartpole_page
 from docs.tools.energy_page import energy_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
@@ -41,7 +42,8 @@ def configuration_page() -> str:
         "agent steps: one decision, `tasks.frame_skip` emulator frames in Atari.",
         "",
         "Presets: `quickstart` (the default of `train`), `paper` (the paper's text), `released` (the authors' script),",
-        "`minatar` (three small games that learn on a CPU), `fast` (for a GPU; not run on one yet).",
+        "`cartpole` (learns in a minute), `minatar` (three small games that learn on a CPU), `fast` (for a GPU; not",
+        "run on one yet).",
         "`docs/algorithm.md` says where the presets come from.",
     ]
     for prefix, text, rows in field_documentation():
@@ -350,6 +352,7 @@ PAGES = {
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,
     "results/recipe/README.md": recipe_page,
+    "results/cartpole/README.md": cartpole_page,
     "docs/performance.md": performance_page,
     "docs/picture.svg": picture,
 }

@@ -77,8 +77,8 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> No
     if needed is not None and config.total_steps < needed:
         lines.append(
             f"This run is far too short to learn {', '.join(config.tasks.names)} (fewer than {needed:,} steps). What "
-            "learns: 'switchmt-snn train minatar' on a CPU (about 20 minutes; scores: results/minatar/README.md; "
-            "extra: minatar); 'switchmt-snn train paper' is meant for a GPU."
+            "learns: 'switchmt-snn train cartpole' (a minute), 'switchmt-snn train minatar' on a CPU (about 20 "
+            "minutes; scores: results/minatar/README.md; extra: minatar); 'switchmt-snn train paper' is for a GPU."
         )
     lines += [
         "Next:",
