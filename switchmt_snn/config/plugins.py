@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import re
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -91,6 +93,21 @@ def plugin_name(plugin: type[Any], key: str) -> PluginName:
             "module that can be imported; a run stores its name, so that it can be resumed"
         )
     return PluginName(name)
+
+
+def failure(error: BaseException) -> str:
+    """One line for what code from outside the package raised, and the place in a file outside the package.
+
+    Example: ``AttributeError: 'float' object has no attribute 'clamp' at my_neurons.py, line 9``.
+    """
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    ours, installed = str(Path(__file__).parents[1]), ("site-packages", "dist-packages", f"{os.sep}lib{os.sep}python")
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith((ours, "<")) and not any(part in frame.filename for part in installed)
+    ]
+    return f"{text} at {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else text
 
 
 def plugin_options(options: Sequence[str], key: str) -> dict[str, bool | int | float | str]:

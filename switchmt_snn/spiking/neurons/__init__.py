@@ -16,6 +16,7 @@ from switchmt_snn.config.plugins import is_plugin, load_plugin
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.neurons.adaptive import AdaptiveLayer, AdaptiveNode
 from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState, OpaqueNode
+from switchmt_snn.spiking.neurons.check import check_neuron
 from switchmt_snn.spiking.neurons.leaky import LeakyLayer, LeakyNode
 from switchmt_snn.spiking.neurons.relu import ReLULayer, ReLUNode
 from switchmt_snn.spiking.neurons.surrogates import (
@@ -70,9 +71,13 @@ def make_neuron_layer(config: NetworkConfig, spiking: bool) -> NeuronLayer:
     """A new layer of the model that ``config.neuron`` names, or of ReLUs for an ANN method.
 
     Raises:
-        ConfigError: see ``neuron_model``; or the model does not have a setting's value.
+        ConfigError: see ``neuron_model``; the model does not have a setting's value; or a class from outside the
+            package does not keep the contract (``check_neuron``).
     """
-    return (neuron_model(config.neuron) if spiking else ReLULayer)(config)
+    model = neuron_model(config.neuron) if spiking else ReLULayer
+    if spiking and is_plugin(config.neuron):
+        check_neuron(model, config)
+    return model(config)
 
 
 __all__ = [
@@ -90,6 +95,7 @@ __all__ = [
     "ReLUNode",
     "SynapticLayer",
     "SynapticNode",
+    "check_neuron",
     "make_neuron_layer",
     "make_surrogate",
     "make_surrogate_gradient",
