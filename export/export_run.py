@@ -17,8 +17,10 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evalu
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
 from switchmt_snn.export.folded import fold_agent, metadata
-from switchmt_snn.export.formats.nir_writer import DIALECT_KEY, NirDialect, can_express, nir_graph, write_nir
-from switchmt_snn.export.formats.onnx_writer import OPSET, decision_model, step_model
+from switchmt_snn.export.formats.nir_writer import DIALECT_KEY, NirDialect, nir_graph, write_nir
+from switchmt_snn.export.formats.obstacles import obstacles
+from switchmt_snn.export.formats.onnx_graph import OPSET
+from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
@@ -41,11 +43,13 @@ class ExportResult:
     Attributes:
         files: paths by what they are.
         parity: the content of ``parity.json``.
+        left_out: formats that cannot express the network, with the reason; empty if a format was asked for.
     """
 
     folder: Path
     files: dict[str, Path]
     parity: dict[str, Any]
+    left_out: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class ExportSettings:
 
     Attributes:
         onnx: ``decision.onnx`` for all tasks, and ``step.onnx`` if the network spikes. With neither ``onnx`` nor
-            ``nir``, every format that can express the network is written.
+            ``nir``, every format that can express the network is written; ``ExportResult.left_out`` names the others.
         nir: one ``<task>.nir`` and ``<task>.json`` per task.
         tasks: also one ``decision_<task>.onnx`` for each of these.
         int8: store the weights as 8-bit integers with one step per output channel.
@@ -87,7 +91,7 @@ def export(
         note: told in a line what goes on.
 
     Raises:
-        ExportError: the network cannot be expressed so.
+        ExportError: a format that was asked for cannot express the network, or none can.
         ParityError: a file decides differently; ``parity.json`` says where.
     """
     settings = settings or ExportSettings()
@@ -102,15 +106,10 @@ def export(
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
     network = fold_agent(agent)
     exported = quantized(network) if settings.int8 else network
-    if not settings.onnx and not settings.nir:
-        settings = replace(settings, onnx=True, nir=can_express(network, settings.nir_dialect))
-    folder = Path(out) if out is not None else run_folder.path / "export"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExportError(
-            f"{folder} cannot be made ({error.strerror}), expected a folder to write to; use --out"
-        ) from error
+    settings, left_out = _formats_that_fit(settings, network)
+    for name, reason in left_out.items():
+        note(f"left out {name.upper()}: {reason}")
+    folder = _made(Path(out) if out is not None else run_folder.path / "export")
     started = time.perf_counter()
     facts = provenance(run_folder.path) | {"weights": "int8" if settings.int8 else "float32"}
     files: dict[str, Path] = {}
@@ -134,13 +133,40 @@ def export(
         r.task: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed} for r in recordings
     }
     parity["wall_s"] = {"write": written_at - started, "record_and_compare": time.perf_counter() - written_at}
+    parity["left_out"] = left_out
     write_atomically(folder / "parity.json", json.dumps(facts | parity, indent=1).encode())
+    if parity["dyadic_skipped"] is not None:
+        note(f"the exact check was left out: {parity['dyadic_skipped']}")
     if parity["failures"]:
         raise ParityError(
             f"parity failed: {'; '.join(parity['failures'])}; expected the trained network's decisions; see "
             f"{folder / 'parity.json'}"
         )
-    return ExportResult(folder, files, parity)
+    return ExportResult(folder, files, parity, left_out)
+
+
+def _made(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(
+            f"{folder} cannot be made ({error.strerror}), expected a folder to write to; use --out"
+        ) from error
+    return folder
+
+
+def _formats_that_fit(settings: ExportSettings, network: FoldedNetwork) -> tuple[ExportSettings, dict[str, str]]:
+    """The settings with every format that fits if none was asked for, and why others are left out.
+
+    Raises:
+        ExportError: no format fits, or one task's ONNX file was asked for and ONNX does not.
+    """
+    if settings.onnx or settings.nir:
+        return settings, {}
+    left_out = obstacles(network, settings.nir_dialect)
+    if "onnx" in left_out and (settings.tasks or "nir" in left_out):
+        raise ExportError(". ".join(left_out[name] for name in left_out if name == "onnx" or not settings.tasks))
+    return replace(settings, onnx="onnx" not in left_out, nir="nir" not in left_out), left_out
 
 
 def _write_onnx(

@@ -15,7 +15,8 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import fold_agent
-from switchmt_snn.export.formats.nir_writer import NirDialect, can_express, nir_graph
+from switchmt_snn.export.formats.nir_writer import NirDialect, nir_graph
+from switchmt_snn.export.formats.obstacles import obstacles
 from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
@@ -99,16 +100,24 @@ def check_parity(
 
     Returns:
         What ``parity.json`` holds; ``failures`` is empty if everything agrees as it must.
+
+    Raises:
+        ExportError: no format can express the network, or observations of a task are missing.
     """
     agent = _agent(source)
     network = fold_agent(agent)
     exported = quantized(network) if int8 else network
     names = agent.suite.names
-    graphs = None
-    if can_express(network, dialect):
+    left_out = obstacles(network, dialect)
+    if len(left_out) == 2:
+        raise ExportError(". ".join(left_out.values()))
+    graphs = decision = step = None
+    if "nir" not in left_out:
         graphs = {name: nir_graph(exported, k, dialect) for k, name in enumerate(names)}
-    step = step_model(exported).SerializeToString() if network.spiking else None
-    written = Exports(exported, decision_model(exported).SerializeToString(), step, graphs)
+    if "onnx" not in left_out:
+        decision = decision_model(exported).SerializeToString()
+        step = step_model(exported).SerializeToString() if network.spiking else None
+    written = Exports(exported, decision, step, graphs)
     if observations is None:
         evaluation = agent.config.evaluation
         observations = {

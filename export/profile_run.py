@@ -25,6 +25,7 @@ from switchmt_snn.export.counts.nir_file import count_nir
 from switchmt_snn.export.energy.estimate import Energy, Target, estimate
 from switchmt_snn.export.energy.traffic import ann_traffic, traffic
 from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.export.formats.obstacles import obstacles
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report.page import Frames, render_report
@@ -96,7 +97,9 @@ def profile(
     recordings = list(recorded_plays(agent, run_folder.path / "recordings", min(decisions, KEPT_DECISIONS)))
     profiles = tuple(_counted(agent, k, recording, decisions) for k, recording in enumerate(recordings))
     fits = [check_fit(layer_shapes(network), chip).to_dict() for chip in selection.chips]
-    bits = sorted({fit["weight_bits"] for fit in fits})
+    # Rounded weights are played by an ONNX graph in memory; nothing else of a profile needs one.
+    no_graph = obstacles(network).get("onnx") if fits else None
+    bits = sorted({fit["weight_bits"] for fit in fits}) if no_graph is None else []
     tasks, frames = [], []
     decisions_per_s = suite_of(agent.config.tasks).decisions_per_s
     for index, (recording, counted) in enumerate(zip(recordings, profiles, strict=True)):
@@ -122,8 +125,10 @@ def profile(
         "training_step": agent.step,
         "decisions_per_s": decisions_per_s,
         "protocol": {r.task: {"epsilon": r.epsilon, "seed": r.seed} for r in recordings},
+        "chips": fits,
+        "precision_left_out": no_graph,
     }
-    return _written(folder, profiles, selection.targets, facts | {"chips": fits}, tasks, tuple(frames))
+    return _written(folder, profiles, selection.targets, facts, tasks, tuple(frames))
 
 
 def profile_file(
@@ -147,7 +152,8 @@ def profile_file(
         raise ConfigError(f"{names} is a chip, expected energy targets for a NIR file; chips are checked for runs")
     counted = count_nir(path, Path(observations))
     folder = _folder(Path(out) if out is not None else path.with_name(f"{path.stem}-profile"))
-    facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps, "chips": [], "decisions_per_s": None}
+    facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps}
+    facts |= {"chips": [], "precision_left_out": None, "decisions_per_s": None}
     tasks = [_task_facts(counted, selection.targets, None, None)]
     return _written(folder, (counted,), selection.targets, facts, tasks, ())
 
@@ -318,6 +324,8 @@ def _headline(tasks: tuple[TaskCounts, ...], energies: list[Energy]) -> str:
     if not tasks[0].spiking:
         return warning + "This is an ANN; its effective counts leave out what a zero activation saves."
     compared = [(energy, energy.by_ann) for energy in energies if energy.by_ann is not None]
+    if not energies:
+        return warning + "No energy target was chosen: counts and chips only."
     if not compared:
         return (
             warning + "None of these targets prices all of the network and its ANN twin: no word on which costs less."

@@ -13,8 +13,9 @@ Dialects:
   minus the threshold back into the integrator, one step later. Synaptic neurons have one more LI for their current.
 - ``legacy``: no ``v_reset`` in the file, so that nir <= 1.0.4 reads it; how a spike resets is in the metadata only.
 
-Each node of the network has one rule; a node without a rule is refused by name. No dialect uses nir.CubaLIF: it resets
-at the spike, while ``snntorch.Synaptic`` resets after the input of the next step.
+Each node of the network has one rule: ``export_synapses`` and ``export_neurons`` of this module. A node without a rule
+is refused by name; a neuron from outside the package registers its own (docs/extending.md, Neuron). No dialect uses
+nir.CubaLIF: it resets at the spike, while ``snntorch.Synaptic`` resets after the input of the next step.
 """
 
 from __future__ import annotations
@@ -33,17 +34,17 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
 from switchmt_snn.spiking.folding import FoldedNetwork
 from switchmt_snn.spiking.layers import Array, Conv, Dense, Float, Layer, NeuronNode, SynapseNode, no_rule
-from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, SynapticNode
+from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, ReLUNode, SynapticNode
 
 NirDialect = Literal["portable", "spikingjelly", "exact", "legacy"]
 DIALECT_KEY = "profile"
 """Metadata key of a file's dialect; files of older versions have it, too."""
 _DT = {"portable": 1.0, "spikingjelly": 1e-4, "exact": 1.0, "legacy": 1.0}
-_REMEDY = "use --onnx"
+_NEURON_REMEDY = "a neuron of your own needs a node() and a NIR rule: docs/extending.md, Neuron"
 
 
 @dataclass
-class _Chain:
+class Chain:
     """A NIR graph while it grows; each appended node hears the one before it."""
 
     last: str
@@ -51,9 +52,15 @@ class _Chain:
     edges: list[tuple[str, str]] = field(default_factory=list)
 
     def append(self, name: str, node: nir.NIRNode) -> None:
+        """Add a node that hears the last one."""
         self.nodes[name] = node
         self.edges.append((self.last, name))
         self.last = name
+
+    def feed_back(self, name: str, node: nir.NIRNode, to: str) -> None:
+        """Close a loop: a node that hears the last one and is heard, one step later, by the node ``to``."""
+        self.nodes[name] = node
+        self.edges += [(self.last, name), (name, to)]
 
 
 def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable") -> nir.NIRGraph:
@@ -66,14 +73,14 @@ def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable
     if dialect not in _DT:
         raise ExportError(f"the NIR dialect is {dialect!r}, expected one of {', '.join(_DT)}")
     network = network.of_task(task)
-    chain = _Chain("input", {"input": nir.Input({"input": np.array(network.encoded_shape)})})
+    chain = Chain("input", {"input": nir.Input({"input": np.array(network.encoded_shape)})})
     shape = network.encoded_shape
     for layer in network.layers:
-        gain_O = _input_gain_O(layer.neurons, dialect)
-        _synapses(layer.synapses, chain, shape, task, gain_O)
-        _neurons(layer.neurons, chain, layer, dialect)
+        gain_O = input_gain_O(layer.neurons, dialect)
+        export_synapses(layer.synapses, chain, shape, task, gain_O)
+        export_neurons(layer.neurons, chain, layer, dialect)
         shape = layer.output_shape
-    _synapses(network.head, chain, shape, task, np.ones(1, np.float32))
+    export_synapses(network.head, chain, shape, task, np.ones(1, np.float32))
     chain.append("output", nir.Output({"output": np.array(network.head.output_shape)}))
     facts = metadata(network) | {
         "task": network.tasks[task],
@@ -82,15 +89,6 @@ def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable
         "output": "head current of one step; readout over the T steps is the host's",
     }
     return nir.NIRGraph(chain.nodes, chain.edges, metadata=_storable(facts))
-
-
-def can_express(network: FoldedNetwork, dialect: NirDialect = "portable") -> bool:
-    """Whether ``nir_graph`` has an exact graph for the network."""
-    try:
-        nir_graph(network, 0, dialect)
-    except ExportError:
-        return False
-    return True
 
 
 def write_nir(graph: nir.NIRGraph, path: Path) -> None:
@@ -109,13 +107,13 @@ def dialect_of(graph: nir.NIRGraph) -> NirDialect:
 
 
 @singledispatch
-def _synapses(node: SynapseNode, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
+def export_synapses(node: SynapseNode, chain: Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
     """Append a layer's synapses, which see a signal of the given shape, with a factor on every output channel."""
-    raise no_rule("NIR", node, _synapses.registry, _REMEDY)
+    raise no_rule("NIR", node, export_synapses.registry, "add a rule to export/formats/nir_writer.py")
 
 
-@_synapses.register
-def _(node: Conv, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
+@export_synapses.register
+def _(node: Conv, chain: Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
     weight, bias = _scaled(node, task, gain_O)
     height, width = node.input_shape[1:]
     stride, padding = _plain(node.stride), _plain(node.padding)
@@ -125,8 +123,8 @@ def _(node: Conv, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Floa
     chain.append(node.name, kernel)
 
 
-@_synapses.register
-def _(node: Dense, chain: _Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
+@export_synapses.register
+def _(node: Dense, chain: Chain, shape: tuple[int, ...], task: int, gain_O: Float) -> None:
     if node.k_winners is not None:
         raise ExportError(
             f"network.k_winners is {node.k_winners}, expected null; NIR cannot compare neurons: use --onnx"
@@ -148,32 +146,37 @@ def _plain(pair: tuple[int, int]) -> int | tuple[int, int]:
 
 
 @singledispatch
-def _input_gain_O(neurons: NeuronNode, dialect: str) -> Float:
-    """Factor on the weights in front of the neurons, per output channel."""
-    raise no_rule("NIR", neurons, _input_gain_O.registry, _REMEDY)
+def input_gain_O(neurons: NeuronNode, dialect: str) -> Float:
+    """Factor on the weights in front of the neurons, per output channel; 1 unless their NIR node scales its input."""
+    return np.ones(1, np.float32)
 
 
-@_input_gain_O.register
+@input_gain_O.register
 def _(neurons: LeakyNode, dialect: str) -> Float:
     if not _decays(neurons.beta_O) or _needs_loop(neurons, dialect):
         return np.ones(1, np.float32)
     return (1.0 / (1.0 - _leak(neurons.beta_O))).astype(np.float32)
 
 
-@_input_gain_O.register(SynapticNode)
-@_input_gain_O.register(AdaptiveNode)
-def _(neurons: NeuronNode, dialect: str) -> Float:
-    return np.ones(1, np.float32)
-
-
 @singledispatch
-def _neurons(neurons: NeuronNode, chain: _Chain, layer: Layer, dialect: str) -> None:
-    """Append a layer's neurons; the node that spikes is called ``<layer>_neurons``."""
-    raise no_rule("NIR", neurons, _neurons.registry, _REMEDY)
+def export_neurons(neurons: NeuronNode, chain: Chain, layer: Layer, dialect: str) -> None:
+    """Append a layer's neurons, by node type; the node that spikes is called ``<layer>_neurons``.
+
+    Args:
+        neurons: the layer's, as its rule is picked by it.
+        chain: hears the layer's currents; a rule appends nodes with parameters of the layer's full shape (``full``).
+        layer: gives names and shapes.
+        dialect: a rule refuses the ones that cannot express its neurons exactly.
+
+    Raises:
+        ExportError: a node without a rule, or a dialect that cannot express it.
+    """
+    remedy = "use --onnx" if isinstance(neurons, ReLUNode) else _NEURON_REMEDY
+    raise no_rule("NIR", neurons, export_neurons.registry, remedy)
 
 
-@_neurons.register
-def _(neurons: LeakyNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+@export_neurons.register
+def _(neurons: LeakyNode, chain: Chain, layer: Layer, dialect: str) -> None:
     if neurons.reset == "subtract" and dialect == "legacy" and _decays(neurons.beta_O):
         raise ExportError(
             "LIF neurons reset by subtraction, expected IF for the NIR dialect 'legacy': its importers subtract at the "
@@ -190,8 +193,8 @@ def _(neurons: LeakyNode, chain: _Chain, layer: Layer, dialect: str) -> None:
         chain.append(f"{layer.name}_neurons", _leaky(neurons, layer, _DT[dialect]))
 
 
-@_neurons.register
-def _(neurons: SynapticNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+@export_neurons.register
+def _(neurons: SynapticNode, chain: Chain, layer: Layer, dialect: str) -> None:
     if neurons.reset != "subtract" or dialect != "exact":
         raise ExportError(
             f"Synaptic neurons reset by {neurons.reset!r} in the NIR dialect {dialect!r}, expected 'subtract' and "
@@ -202,8 +205,8 @@ def _(neurons: SynapticNode, chain: _Chain, layer: Layer, dialect: str) -> None:
     _append_loop(neurons, chain, layer, _DT[dialect])
 
 
-@_neurons.register
-def _(neurons: AdaptiveNode, chain: _Chain, layer: Layer, dialect: str) -> None:
+@export_neurons.register
+def _(neurons: AdaptiveNode, chain: Chain, layer: Layer, dialect: str) -> None:
     raise ExportError("NIR cannot express ALIF: no node has a threshold that changes; use --onnx")
 
 
@@ -223,31 +226,30 @@ def _leak(decay_O: Array) -> Array:
 
 def _leaky(neurons: LeakyNode, layer: Layer, dt: float) -> nir.NIRNode:
     """IF or LIF with parameters of the layer's full shape (importers do not broadcast)."""
-    threshold, zero = _full(layer, neurons.threshold_O), _full(layer, 0.0)
+    threshold, zero = full(layer, neurons.threshold_O), full(layer, 0.0)
     if not _decays(neurons.beta_O):
-        return nir.IF(r=_full(layer, 1.0 / dt), v_threshold=threshold, v_reset=zero)
-    tau = _full(layer, dt / (1.0 - _leak(neurons.beta_O)))
-    return nir.LIF(tau=tau, r=_full(layer, 1.0), v_leak=zero, v_threshold=threshold, v_reset=zero.copy())
+        return nir.IF(r=full(layer, 1.0 / dt), v_threshold=threshold, v_reset=zero)
+    tau = full(layer, dt / (1.0 - _leak(neurons.beta_O)))
+    return nir.LIF(tau=tau, r=full(layer, 1.0), v_leak=zero, v_threshold=threshold, v_reset=zero.copy())
 
 
 def _integrator(layer: Layer, decay_O: Array, dt: float) -> nir.NIRNode:
     """``v(t) = decay v(t-1) + x(t)``."""
     if not _decays(decay_O):
-        return nir.I(r=_full(layer, 1.0 / dt))
+        return nir.I(r=full(layer, 1.0 / dt))
     tau = dt / (1.0 - _leak(decay_O))
-    return nir.LI(tau=_full(layer, tau), r=_full(layer, tau / dt), v_leak=_full(layer, 0.0))
+    return nir.LI(tau=full(layer, tau), r=full(layer, tau / dt), v_leak=full(layer, 0.0))
 
 
-def _append_loop(neurons: LeakyNode | SynapticNode, chain: _Chain, layer: Layer, dt: float) -> None:
+def _append_loop(neurons: LeakyNode | SynapticNode, chain: Chain, layer: Layer, dt: float) -> None:
     """``U(t) = beta U(t-1) + I(t) - threshold S(t-1)``; the Threshold carries the layer's neuron name."""
     membrane, reset = f"{layer.name}_membrane", f"{layer.name}_reset"
     chain.append(membrane, _integrator(layer, neurons.beta_O, dt))
-    chain.append(f"{layer.name}_neurons", nir.Threshold(threshold=_full(layer, neurons.threshold_O)))
-    chain.nodes[reset] = nir.Scale(scale=_full(layer, -neurons.threshold_O))
-    chain.edges += [(chain.last, reset), (reset, membrane)]
+    chain.append(f"{layer.name}_neurons", nir.Threshold(threshold=full(layer, neurons.threshold_O)))
+    chain.feed_back(reset, nir.Scale(scale=full(layer, -neurons.threshold_O)), membrane)
 
 
-def _full(layer: Layer, value_O: npt.ArrayLike) -> Float:
+def full(layer: Layer, value_O: npt.ArrayLike) -> Float:
     """A parameter of every neuron of a layer, from one number or one per output channel."""
     by_channel = np.reshape(value_O, (-1, *(1,) * (len(layer.output_shape) - 1)))
     return np.ascontiguousarray(np.broadcast_to(by_channel, layer.output_shape), np.float32)

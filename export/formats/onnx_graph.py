@@ -10,6 +10,8 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+OPSET = 18
+"""Operator set of the files (that of ONNX 1.13)."""
 FLOAT, INT64 = TensorProto.FLOAT, TensorProto.INT64
 
 
@@ -24,8 +26,14 @@ class Graph:
         """A subgraph, empty, which shares the constants."""
         return Graph([], self.constants)
 
-    def constant(self, name: str, value: npt.ArrayLike, dtype: npt.DTypeLike = np.float32) -> str:
-        """Store a value under a name, once; returns the name."""
+    def constant(self, name: str, value: npt.ArrayLike, dtype: npt.DTypeLike | None = None) -> str:
+        """Store a value under a name, once; returns the name.
+
+        Without a dtype, an array of integers or booleans keeps its own (as axes and indices need), and everything else
+        is float32: numbers, lists, float arrays.
+        """
+        if dtype is None:
+            dtype = value.dtype if isinstance(value, np.ndarray) and value.dtype.kind in "iub" else np.float32
         if name not in self.constants:
             self.constants[name] = numpy_helper.from_array(np.asarray(value, dtype), name)
         return name

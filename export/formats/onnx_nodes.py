@@ -1,4 +1,7 @@
-"""The nodes of a network as ONNX operators: one rule per node type; a node without a rule is refused by name.
+"""The layers of a network as ONNX operators: ``export_synapses`` and ``export_neurons``, one rule per node type.
+
+A node without a rule is refused by name. A neuron from outside the package registers its own rule with
+``export_neurons.register`` (docs/extending.md, Neuron).
 
 Shapes: B batch, O outputs of a layer, K tasks.
 """
@@ -17,6 +20,7 @@ from switchmt_snn.spiking.layers import Array, Conv, Dense, Layer, NeuronNode, S
 from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, ReLUNode, SynapticNode
 
 _REMEDY = "add a rule to export/formats/onnx_nodes.py"
+_NEURON_REMEDY = "a neuron of your own needs a node() and an ONNX rule: docs/extending.md, Neuron"
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ def _weight(graph: Graph, node: SynapseNode, weight: npt.NDArray[Any], task: int
     return graph.add("DequantizeLinear", [stored, steps], name, axis=0)
 
 
-def current_of(graph: Graph, node: SynapseNode, weights: Weights, x: str) -> str:
+def export_synapses(graph: Graph, node: SynapseNode, weights: Weights, x: str) -> str:
     """The layer's input currents ``[B, *output_shape]`` for inputs ``x``."""
     name = node.name
     y = _products(node, graph, [weights.weight, *([weights.bias] if weights.bias else [])], x)
@@ -125,46 +129,55 @@ def _(node: Dense, graph: Graph, current: str) -> str:
     return graph.add("Flatten", [kept], f"{name}_current", axis=1)
 
 
-def fire(graph: Graph, layer: Layer, current: str) -> str:
-    """One step of a layer's neurons: each ``<state>_<layer>`` becomes ``<state>_<layer>_next``; returns the spikes."""
-    return _step(layer.neurons, graph, layer, current)
-
-
 @singledispatch
-def _step(neurons: NeuronNode, graph: Graph, layer: Layer, current: str) -> str:
-    """The neurons' equation; spikes and activations are floats."""
-    raise no_rule("ONNX", neurons, _step.registry, _REMEDY)
+def export_neurons(neurons: NeuronNode, graph: Graph, layer: Layer, current: str) -> str:
+    """One simulation step of a layer's neurons: the operators of their equation, by node type.
+
+    Args:
+        neurons: the layer's, as its rule is picked by it.
+        graph: where the operators go.
+        layer: gives the names. Each state variable of the node is the value ``<state>_<layer>``; a rule defines
+            ``<state>_<layer>_next``.
+        current: name of the input currents ``[B, *output_shape]`` of the step.
+
+    Returns:
+        The name of the spikes, or of an ANN's activations: floats ``[B, *output_shape]``, named ``spikes_<layer>``.
+
+    Raises:
+        ExportError: a node without a rule.
+    """
+    raise no_rule("ONNX", neurons, export_neurons.registry, _NEURON_REMEDY)
 
 
-@_step.register
+@export_neurons.register
 def _(neurons: ReLUNode, graph: Graph, layer: Layer, current: str) -> str:
     return graph.add("Relu", [current], f"{layer.name}_activity")
 
 
-@_step.register
+@export_neurons.register
 def _(neurons: LeakyNode, graph: Graph, layer: Layer, current: str) -> str:
     name = layer.name
-    threshold = graph.constant(f"{name}_threshold", _by_channel(layer, neurons.threshold_O))
+    threshold = graph.constant(f"{name}_threshold", by_channel(layer, neurons.threshold_O))
     u, following = f"membrane_{name}", f"membrane_{name}_next"
     owed = graph.add("Greater", [u, threshold], f"{name}_reset_owed")
     if neurons.reset == "zero":
         u = graph.add("Where", [owed, graph.constant("zero", 0.0), u], f"{name}_after_reset")
     if (neurons.beta_O != 1.0).any():
-        u = graph.add("Mul", [u, graph.constant(f"{name}_beta", _by_channel(layer, neurons.beta_O))], f"{name}_decayed")
+        u = graph.add("Mul", [u, graph.constant(f"{name}_beta", by_channel(layer, neurons.beta_O))], f"{name}_decayed")
     if neurons.reset == "zero":
         graph.add("Add", [u, current], following)
     else:
         u = graph.add("Add", [u, current], f"{name}_charged")
         amount = graph.add("Where", [owed, threshold, graph.constant("zero", 0.0)], f"{name}_reset_by")
         graph.add("Sub", [u, amount], following)
-    return _compared(graph, layer, following, threshold)
+    return spikes_above(graph, layer, following, threshold)
 
 
-@_step.register
+@export_neurons.register
 def _(neurons: SynapticNode, graph: Graph, layer: Layer, current: str) -> str:
     name = layer.name
     threshold, beta, alpha = (
-        graph.constant(f"{name}_{of}", _by_channel(layer, values_O))
+        graph.constant(f"{name}_{of}", by_channel(layer, values_O))
         for of, values_O in (("threshold", neurons.threshold_O), ("beta", neurons.beta_O), ("alpha", neurons.alpha_O))
     )
     u, following = f"membrane_{name}", f"membrane_{name}_next"
@@ -177,14 +190,14 @@ def _(neurons: SynapticNode, graph: Graph, layer: Layer, current: str) -> str:
         graph.add("Where", [owed, zero, charged], following)
     else:
         graph.add("Sub", [charged, graph.add("Where", [owed, threshold, zero], f"{name}_reset_by")], following)
-    return _compared(graph, layer, following, threshold)
+    return spikes_above(graph, layer, following, threshold)
 
 
-@_step.register
+@export_neurons.register
 def _(neurons: AdaptiveNode, graph: Graph, layer: Layer, current: str) -> str:
     name = layer.name
     rest, beta, decay, strength = (
-        graph.constant(f"{name}_{of}", _by_channel(layer, values_O))
+        graph.constant(f"{name}_{of}", by_channel(layer, values_O))
         for of, values_O in (
             ("threshold", neurons.threshold_O),
             ("beta", neurons.beta_O),
@@ -207,15 +220,15 @@ def _(neurons: AdaptiveNode, graph: Graph, layer: Layer, current: str) -> str:
     jump = graph.add("Cast", [spiked], f"{name}_jump", to=FLOAT)
     graph.add("Add", [graph.add("Mul", [a, decay], f"{name}_adaptation_decayed"), jump], adapted)
     risen = graph.add("Mul", [adapted, strength], f"{name}_next_rise")
-    return _compared(graph, layer, following, graph.add("Add", [rest, risen], f"{name}_next_threshold"))
+    return spikes_above(graph, layer, following, graph.add("Add", [rest, risen], f"{name}_next_threshold"))
 
 
-def _compared(graph: Graph, layer: Layer, membrane: str, threshold: str) -> str:
+def spikes_above(graph: Graph, layer: Layer, membrane: str, threshold: str) -> str:
     """The spikes: where the membrane is strictly above the threshold."""
     fired = graph.add("Greater", [membrane, threshold], f"{layer.name}_fired")
     return graph.add("Cast", [fired], f"spikes_{layer.name}", to=FLOAT)
 
 
-def _by_channel(layer: Layer, values_O: Array) -> Array:
+def by_channel(layer: Layer, values_O: Array) -> Array:
     """Values per output channel, shaped to broadcast over the layer's output."""
     return values_O.reshape(-1, *(1,) * (len(layer.output_shape) - 1))

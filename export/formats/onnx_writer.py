@@ -21,12 +21,10 @@ from onnx import helper, numpy_helper
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
 from switchmt_snn.export.formats.onnx_encodings import encode, observation_input
-from switchmt_snn.export.formats.onnx_graph import FLOAT, INT64, Graph
-from switchmt_snn.export.formats.onnx_nodes import Weights, current_of, fire, weights_of
+from switchmt_snn.export.formats.onnx_graph import FLOAT, INT64, OPSET, Graph
+from switchmt_snn.export.formats.onnx_nodes import Weights, export_neurons, export_synapses, weights_of
 from switchmt_snn.spiking.folding import FoldedNetwork
 
-OPSET = 18
-"""Operator set of the files (that of ONNX 1.13)."""
 _IR_VERSION = 8
 
 
@@ -51,8 +49,9 @@ def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.Mode
     else:
         x = encoded
         for layer in network.layers:
-            x = fire(graph, layer, current_of(graph, layer.synapses, weights[layer.name], x))
-        q = current_of(graph, network.head, weights["head"], x)
+            current = export_synapses(graph, layer.synapses, weights[layer.name], x)
+            x = export_neurons(layer.neurons, graph, layer, current)
+        q = export_synapses(graph, network.head, weights["head"], x)
     _mask(graph, network, q, task)
     return _model(graph, network, "decision", inputs, outputs, task)
 
@@ -84,8 +83,9 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
         inputs += [helper.make_tensor_value_info(state, FLOAT, shape) for state in states]
         given = [f"spikes_{layer.name}", *(f"{state}_next" for state in states)]
         outputs += [helper.make_tensor_value_info(name, FLOAT, shape) for name in given]
-        x = fire(graph, layer, current_of(graph, layer.synapses, weights[layer.name], x))
-    graph.add("Identity", [current_of(graph, network.head, weights["head"], x)], "q_step")
+        current = export_synapses(graph, layer.synapses, weights[layer.name], x)
+        x = export_neurons(layer.neurons, graph, layer, current)
+    graph.add("Identity", [export_synapses(graph, network.head, weights["head"], x)], "q_step")
     return _model(graph, network, "step", inputs, outputs, task)
 
 
@@ -104,7 +104,11 @@ def _model(
     if task is not None:
         facts |= {"task": network.tasks[task], "tasks": [network.tasks[task]]}
     helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()})
-    onnx.checker.check_model(model, full_check=True)
+    try:
+        onnx.checker.check_model(model, full_check=True)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
+        reason = " ".join(str(error).split())
+        raise ExportError(f"the {name} graph is no valid ONNX ({reason:.200}), expected one; mend its rules") from error
     return model
 
 
@@ -114,7 +118,7 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
     if (
         network.constant_input
     ):  # the first layer's current is the same at every step: computed once, seen from within the Scan
-        current = current_of(graph, layers[0].synapses, weights[layers[0].name], encoded)
+        current = export_synapses(graph, layers[0].synapses, weights[layers[0].name], encoded)
         steps = graph.constant("steps", np.arange(timesteps), np.int64)
         batch_of, batch_axis = current, 0
     else:
@@ -124,7 +128,8 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
     counts = []
     for index, layer in enumerate(layers):
         first = network.constant_input and index == 0
-        x = fire(body, layer, current if first else current_of(body, layer.synapses, weights[layer.name], x))
+        fed = current if first else export_synapses(body, layer.synapses, weights[layer.name], x)
+        x = export_neurons(layer.neurons, body, layer, fed)
         axes = graph.constant(f"{layer.name}_axes", list(range(1, 1 + len(layer.output_shape))), np.int64)
         total = body.add("ReduceSum", [x, axes], f"{layer.name}_total", keepdims=0)
         counts.append(body.add("Unsqueeze", [total, graph.constant("axis_1", [1], np.int64)], f"{layer.name}_count"))
@@ -138,7 +143,7 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
     else:
         states["readout"] = network.head.output_shape
         decayed = body.add("Mul", ["readout", graph.constant("readout_beta", readout.beta)], "readout_decayed")
-        body.add("Add", [decayed, current_of(body, network.head, weights["head"], x)], "readout_next")
+        body.add("Add", [decayed, export_synapses(body, network.head, weights["head"], x)], "readout_next")
         if readout.kind == "max_membrane":
             states["largest"] = network.head.output_shape
             body.add("Max", ["largest", "readout_next"], "largest_next")
@@ -147,7 +152,7 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
     if readout.kind != "mean":
         return "readout_final" if readout.kind == "last_membrane" else "largest_final"
     rate = graph.add("Div", ["spike_sum_final", graph.constant("timesteps", timesteps)], "mean_spikes")
-    return current_of(graph, network.head, weights["head"], rate)
+    return export_synapses(graph, network.head, weights["head"], rate)
 
 
 def _scan(

@@ -78,7 +78,7 @@ def dyadic_copy(agent: Agent, weight_bits: int = 5) -> Agent:
             elif isinstance(module, ActiveDendrites):
                 _round_dendrites(module)
             elif isinstance(module, NeuronLayer):
-                _round_neurons(module)
+                round_neurons(module)
         for name, stream in network.streams.items():
             outputs = network.observation.num_actions if name != "value" else 1
             _exact_means(cast(Stream, stream).head, network.config.quantiles, outputs, name == "advantage")
@@ -109,7 +109,7 @@ def wake_silent_layers(agent: Agent, observations_by_task: list[npt.NDArray[Any]
                 break
             with torch.no_grad():
                 for name in names:
-                    _threshold(cast(Any, layers[name]).neurons).div_(2.0)
+                    threshold_of(cast(Any, layers[name]).neurons).div_(2.0)
 
 
 def is_exact(agent: Agent, task: int, observations: npt.NDArray[Any], seed: int = 0) -> bool:
@@ -171,34 +171,49 @@ def _dyadic_decay(value: Tensor | float) -> float:
 
 
 @singledispatch
-def _round_neurons(layer: NeuronLayer) -> None:
-    """Make a layer's parameters dyadic; a membrane that does not decay stays so."""
-    raise ExportError(
-        f"the dyadic copy cannot express {type(layer).__name__}, expected a registered neuron model; add a rule to "
-        "export/parity/dyadic.py"
+def round_neurons(layer: NeuronLayer) -> None:
+    """Make a layer's parameters dyadic, in place; a membrane that does not decay stays so. One rule per class."""
+    raise ExportError(_no_rule(layer))
+
+
+def cannot_copy(agent: Agent) -> str | None:
+    """Why an agent has no dyadic copy: its neurons are of a class without rules; None if it has one."""
+    none = round_neurons.dispatch(object), threshold_of.dispatch(object)
+    for module in agent.network.modules():
+        if isinstance(module, NeuronLayer) and not isinstance(module, ReLULayer):
+            rules = round_neurons.dispatch(type(module)), threshold_of.dispatch(type(module))
+            if any(rule is default for rule, default in zip(rules, none, strict=True)):
+                return _no_rule(module)
+    return None
+
+
+def _no_rule(layer: NeuronLayer) -> str:
+    return (
+        f"{type(layer).__module__}:{type(layer).__name__} has no rule that makes its parameters dyadic, expected "
+        "round_neurons and threshold_of of switchmt_snn.export.parity.dyadic (docs/extending.md, Neuron)"
     )
 
 
-@_round_neurons.register
+@round_neurons.register
 def _(layer: ReLULayer) -> None:
     pass
 
 
-@_round_neurons.register
+@round_neurons.register
 def _(layer: LeakyLayer) -> None:
     _round_threshold(layer)
     if float(layer.leaky.beta) != 1.0:
         layer.leaky.beta.fill_(_dyadic_decay(layer.leaky.beta))
 
 
-@_round_neurons.register
+@round_neurons.register
 def _(layer: SynapticLayer) -> None:
     _round_threshold(layer)
     layer.synaptic.alpha.fill_(_dyadic_decay(layer.synaptic.alpha))
     layer.synaptic.beta.fill_(_dyadic_decay(layer.synaptic.beta))
 
 
-@_round_neurons.register
+@round_neurons.register
 def _(layer: AdaptiveLayer) -> None:
     _round_threshold(layer)
     layer.beta.fill_(_dyadic_decay(layer.beta))
@@ -206,27 +221,27 @@ def _(layer: AdaptiveLayer) -> None:
 
 
 def _round_threshold(layer: NeuronLayer) -> None:
-    threshold = _threshold(layer)
+    threshold = threshold_of(layer)
     threshold.copy_(_to_grid(threshold, 3).clamp(min=0.125))
 
 
 @singledispatch
-def _threshold(layer: NeuronLayer) -> Tensor:
+def threshold_of(layer: NeuronLayer) -> Tensor:
     """The threshold (at rest) of a layer's neurons, to be changed in place."""
-    raise ExportError(f"{type(layer).__name__} has no threshold, expected a spiking neuron model")
+    raise ExportError(_no_rule(layer))
 
 
-@_threshold.register
+@threshold_of.register
 def _(layer: LeakyLayer) -> Tensor:
     return cast(Tensor, layer.leaky.threshold)
 
 
-@_threshold.register
+@threshold_of.register
 def _(layer: SynapticLayer) -> Tensor:
     return cast(Tensor, layer.synaptic.threshold)
 
 
-@_threshold.register
+@threshold_of.register
 def _(layer: AdaptiveLayer) -> Tensor:
     return layer.threshold
 

@@ -149,10 +149,11 @@ def fit_table(profile: dict[str, Any]) -> Table:
         for effect in task["precision"]
     ]
     bits = ", ".join(dict.fromkeys(str(chip["weight_bits"]) for chip in profile["chips"]))
-    table = _table(
-        "Will it fit? Public limits of memory and size, layer by layer (all of them: report.html)",
-        f"Same action with weights of {bits} bits: {', '.join(effects)}.",
-    )
+    rounding = f"Same action with weights of {bits} bits: {', '.join(effects)}."
+    if profile["precision_left_out"] is not None:
+        rounding = f"What weights of {bits} bits do to the actions is left out: {profile['precision_left_out']}."
+    title = "Will it fit? Public limits of memory and size, layer by layer (all of them: report.html)"
+    table = _table(title, rounding)
     _add_columns(table, ("chip", "fits", "tightest"), ())
     table.add_column("needs, of what there is")
     for chip in profile["chips"]:

@@ -50,6 +50,6 @@ def test_an_encoding_from_outside_trains_continues_and_exports_with_its_rule(
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
     assert evaluate("whole", episodes=1, save=False).step == STEPS
     with pytest.raises(ExportError, match=r"ONNX has no rule for .* my_encodings:Thermometer"):
-        export("whole")
+        export("whole", ExportSettings(onnx=True))
     assert export("whole", ExportSettings(nir=True, parity_decisions=20)).files
     assert "decision.onnx" in in_fresh_process(tmp_path, "export_own.py")

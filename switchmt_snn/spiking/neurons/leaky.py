@@ -123,7 +123,7 @@ class LeakyLayer(NeuronLayer):
 
 
 class _FusedLeaky(torch.autograd.Function):
-    """T steps of ``snntorch.Leaky`` with fixed beta and threshold.
+    """T steps of ``LeakyLayer.step`` with fixed beta and threshold, and their gradients, in one autograd function.
 
     Spikes are kept as floats and resets written as ``u - u * s``, which is exactly 0 or u: arithmetic between floats
     and booleans, and ``torch.where``, are up to 30 times slower on a CPU.
