@@ -28,7 +28,8 @@ class Selection:
         """Select by name and by file; a name may be both an energy target and a chip. None selects all built-in ones.
 
         Raises:
-            ConfigError: no such target or chip, a file that is neither, or one name for two of a kind.
+            ConfigError: no such target or chip, a file that is neither or takes a built-in one's name, or one name
+                for two.
         """
         known, chips = builtin_targets(), builtin_chips()
         names = (names,) if isinstance(names, (str, Path)) else names
@@ -37,7 +38,7 @@ class Selection:
         found: list[Target | Chip] = []
         for name in dict.fromkeys(map(str, names)):
             if Path(name).suffix in SUFFIXES:
-                found.append(_read(name))
+                found.append(_own_name(_read(name), name))
             elif name in known or name in chips:
                 found += [built_in[name] for built_in in (known, chips) if name in built_in]
             else:
@@ -59,6 +60,17 @@ def _read(file: str) -> Target | Chip:
     if kind not in KINDS:
         raise ConfigError(f"{file}: kind is {kind!r:.60}, expected one of {', '.join(KINDS)}")
     return read_chip(raw, file) if kind == "chip" else read_target(raw, file)
+
+
+def _own_name(read: Target | Chip, file: str) -> Target | Chip:
+    """What a file holds, if its name does not stand for other numbers that come with the package."""
+    kind, built_in = ("energy target", builtin_targets()) if isinstance(read, Target) else ("chip", builtin_chips())
+    if built_in.get(read.name, read) != read:
+        raise ConfigError(
+            f"{file}: name is {read.name!r}, which is a built-in {kind} with other numbers, expected a name of its "
+            "own; change the name in your file"
+        )
+    return read
 
 
 def _require_different_names(what: str, names: list[str]) -> None:

@@ -124,11 +124,12 @@ class Section:
             raise self.wrong(key, f"one of {', '.join(allowed)}{hint if hint.startswith('; did') else ''}")
         return value
 
-    def texts(self, key: str, allowed: Sequence[str] | None = None) -> tuple[str, ...]:
-        """A list of texts, at least one; all of them among the allowed ones, if these are given."""
+    def texts(self, key: str, allowed: Sequence[str] | None = None, empty: bool = False) -> tuple[str, ...]:
+        """A list of texts, at least one unless it may be empty; all among the allowed ones, if these are given."""
         items = self.raw[key]
-        if not isinstance(items, list) or not items or not all(isinstance(item, str) and item for item in items):
-            raise self.wrong(key, "a list of texts with at least one")
+        listed = isinstance(items, list) and all(isinstance(item, str) and item for item in items)
+        if not listed or not (items or empty):
+            raise self.wrong(key, f"a list of texts{'' if empty else ' with at least one'}")
         for item in items:
             if allowed is not None and item not in allowed:
                 raise ConfigError(f"{self.where}: {self.name(key)} has {item!r}{did_you_mean(item, allowed)}")

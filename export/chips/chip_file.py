@@ -10,16 +10,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any, cast, get_args
 
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.config.plugins import is_plugin
+from switchmt_snn.errors import ConfigError, did_you_mean, nearest
 from switchmt_snn.export.chips.chip import Chip
 from switchmt_snn.export.chips.limits import Only, Per, Resource
 from switchmt_snn.export.chips.mappings import ConvolutionCore, CorePerLayer, Mapping, SharedCore, WholeCores
 from switchmt_snn.export.chips.rules import RULES, Widths
 from switchmt_snn.export.chips.shapes import LAYER_KINDS
 from switchmt_snn.export.yaml_files import SUFFIXES, Section, builtin_files, file_text, parse
+from switchmt_snn.spiking.neurons import NEURONS
 
 _TEXTS = ("name", "title", "vendor", "source")
-_NEEDED = (*_TEXTS, "takes", "layers", "neurons", "weight_bits", "mapping", "limits", "notes")
+_NEEDED = (*_TEXTS, "takes", "layers", "neurons", "weight_bits", "mapping", "limits")
+_OPTIONAL = ("kind", "state_bits", "notes")
 _OF_LIMIT = ("per", "only", "whole_channels", "source")
 
 
@@ -51,7 +54,7 @@ def read_chip(raw: Any, where: str) -> Chip:
     Raises:
         ConfigError: a key is missing, unknown or of the wrong type, or two of them contradict each other.
     """
-    file = Section(where, raw, "", _NEEDED, ("kind", "state_bits"))
+    file = Section(where, raw, "", _NEEDED, _OPTIONAL)
     if "kind" in file:
         file.choice("kind", ("chip",))
     mapping = _mapping(file)
@@ -67,12 +70,23 @@ def read_chip(raw: Any, where: str) -> Chip:
         source=source,
         takes=cast(Any, file.choice("takes", ("spikes", "values"))),
         layers=file.texts("layers", LAYER_KINDS),
-        neurons=file.texts("neurons"),
+        neurons=_neurons(file),
         widths=Widths(file.whole("weight_bits", 2, 32, "bits"), state_bits),
         mapping=mapping,
         resources=tuple(_resource(limits, str(resource), mapping, state_bits) for resource in limits.raw),
-        notes=file.texts("notes"),
+        notes=file.texts("notes", empty=True) if "notes" in file else (),
     )
+
+
+def _neurons(file: Section) -> tuple[str, ...]:
+    kinds = file.texts("neurons")
+    for kind in kinds:
+        if kind not in NEURONS and not is_plugin(kind):
+            raise ConfigError(
+                f"{file.where}: neurons has {kind!r}, expected {', '.join(NEURONS)}, or a neuron of your own as "
+                f"module:Class{nearest(kind, NEURONS)}"
+            )
+    return kinds
 
 
 def _resource(limits: Section, resource: str, mapping: Mapping, state_bits: int | None) -> Resource:

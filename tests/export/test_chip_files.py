@@ -191,6 +191,8 @@ def test_a_head_needs_no_neurons_of_the_chip() -> None:
         ({"weight_bits": 1}, "weight_bits is 1, expected a whole number of bits, 2 to 32"),
         ({"neurons": "IF"}, "neurons is 'IF', expected a list of texts"),
         ({"neurons": []}, "neurons is [], expected a list of texts with at least one"),
+        ({"neurons": ["IF", "LIFF"]}, "neurons has 'LIFF', expected IF, LIF, Synaptic, ALIF, or a neuron of your own"),
+        ({"notes": "none"}, "notes is 'none', expected a list of texts"),
         ({"layers": ["conf"]}, "layers has 'conf'; did you mean 'conv'"),
         ({"limits": [1]}, "limits is [1], expected keys and values"),
         ({"limits": {}}, "limits is {}, expected at least one limit"),
@@ -260,9 +262,25 @@ def test_files_of_both_kinds_are_told_apart(tmp_path: Path) -> None:
         assert [target.name for target in select(raw).targets] == ["x"]
     with pytest.raises(ConfigError, match="kind is 'chips', expected one of energy, chip"):
         select({**CHIP, "kind": "chips"})
-    (tmp_path / "my.yaml").write_text(yaml.safe_dump({**CHIP, "name": "speck"}))
+    for name in ("one.yaml", "two.yaml"):
+        (tmp_path / name).write_text(yaml.safe_dump(CHIP))
     with pytest.raises(ConfigError, match="two chips have one name"):
-        Selection.of([tmp_path / "my.yaml", "speck"])
+        Selection.of([tmp_path / "one.yaml", tmp_path / "two.yaml"])
+
+
+def test_a_file_cannot_pass_for_a_built_in_target_or_chip(tmp_path: Path) -> None:
+    target = ROOT / "export" / "energy" / "targets" / "loihi-2018.yaml"
+    cheaper = yaml.safe_load(target.read_text()) | {"operations": {"ac": 0.001}}
+    for raw, kind in ((cheaper, "energy target"), ({**CHIP, "name": "speck"}, "chip")):
+        (tmp_path / "my.yaml").write_text(yaml.safe_dump(raw))
+        with pytest.raises(ConfigError, match=rf"my\.yaml: name is '{raw['name']}', which is a built-in {kind} "):
+            Selection.of([tmp_path / "my.yaml"])
+    assert Selection.of([target]) == Selection.of(["loihi-2018"])
+
+
+def test_notes_may_be_left_out_or_empty() -> None:
+    assert read_chip(changed({"notes": REMOVED}), "my.yaml").notes == ()
+    assert chip(notes=[]).notes == ()
 
 
 def test_a_name_of_both_kinds_selects_both_and_no_name_everything() -> None:

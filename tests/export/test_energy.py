@@ -212,7 +212,7 @@ def test_a_target_of_ones_own(trained_run: Path, tmp_path: Path, run_command: Ru
     assert "The spiking network costs" in out
     (tmp_path / "twin.yaml").write_text(make(name="loihi-2018"))
     _, err = run_command("profile", trained_run, "--target", tmp_path / "twin.yaml", "--target", "loihi-2018", code=2)
-    assert "two targets have one name" in err
+    assert "name is 'loihi-2018', which is a built-in energy target" in err
     (tmp_path / "chip.yaml").write_text(make(unit="eV"))
     _, err = run_command("profile", trained_run, "--target", tmp_path / "chip.yaml", code=2)
     assert "unit is 'eV'" in err

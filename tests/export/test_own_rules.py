@@ -181,7 +181,7 @@ def test_an_own_neuron_with_rules_is_exported_compared_and_counted(recipes: Path
     run_command("profile", run, "--decisions", 20, "--target", "loihi-2")
     facts = json.loads((run / "profile" / "profile.json").read_text())
     assert facts["tasks"][0]["precision"][0]["bits"] == 8
-    assert "neuron kind PartialReset" in facts["chips"][0]["layers"][0]["not_held"]
+    assert "neuron kind my_neurons:PartialReset" in facts["chips"][0]["layers"][0]["not_held"]
     assert facts["tasks"][0]["layers"][0]["states"] == 1
 
 
