@@ -77,6 +77,16 @@ def import_plugin_module(module_name: str) -> ModuleType:
         raise ImportError(" ".join(f"{type(error).__name__}: {error}".split())) from error
 
 
+def plugin_file(name: str) -> Path | None:
+    """The source file of the module of ``package.module:Name``; None if it has none (built in, interactive).
+
+    Raises:
+        ImportError: see ``import_plugin_module``.
+    """
+    path = getattr(import_plugin_module(name.partition(":")[0]), "__file__", None)
+    return None if path is None else Path(path)
+
+
 def plugin_name(plugin: type[Any], key: str) -> PluginName:
     """The ``package.module:Name`` by which ``load_plugin`` finds a class again.
 

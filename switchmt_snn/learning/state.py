@@ -11,6 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from switchmt_snn.errors import CheckpointError
+
 
 class Stateful:
     """A part whose ``SAVED`` attributes make up its state.
@@ -27,7 +29,17 @@ class Stateful:
         return {name: _packed(getattr(self, name)) for name in self.SAVED}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put a saved state back; parts and generators are filled in place."""
+        """Put a saved state back; parts and generators are filled in place.
+
+        Raises:
+            CheckpointError: an attribute was not saved.
+        """
+        missing = [name for name in self.SAVED if name not in state]
+        if missing:
+            raise CheckpointError(
+                f"the checkpoint has no {', '.join(missing)} of {type(self).__name__}, expected what its SAVED names; "
+                "if its code changed, restore it, or start a new run with --run"
+            )
         for name in self.SAVED:
             setattr(self, name, _unpacked(getattr(self, name), state[name]))
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,25 @@ class LoadedCheckpoint:
     state: dict[str, Any]
     log_sizes: dict[str, int]
     damaged: tuple[str, ...]
+
+
+@contextmanager
+def fitting_weights() -> Iterator[None]:
+    """Within it, weights that do not fit the network's parameters are an error of one line.
+
+    Raises:
+        CheckpointError: a parameter is missing, unknown or of another shape.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "loading state_dict" not in str(error):
+            raise
+        reason = " ".join(str(error).split())
+        raise CheckpointError(
+            f"the checkpoint does not fit the network ({reason:.400}), expected the parameters that it was saved with; "
+            "if the code of a neuron changed, restore it, or start a new run with --run"
+        ) from error
 
 
 class CheckpointStore:

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.config.plugins import is_plugin, plugin_file
 from switchmt_snn.tasks.registry import SUITES, suite_of
 
 _PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "safetensors", "zstandard")
@@ -22,7 +23,7 @@ _PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "safetensors", "zstan
 
 
 def describe_environment(config: ExperimentConfig, device: torch.device) -> dict[str, Any]:
-    """Facts that a reader of the run's numbers needs: versions, machine, device, files of the suite, command."""
+    """Facts that a reader of the run's numbers needs: versions, machine, device, files, command."""
     suite = suite_of(config.tasks)
     suites = (*SUITES.values(), type(suite))
     versions: dict[str, str | None] = {}
@@ -43,8 +44,18 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
         "device": str(device),
         "device_name": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
         "versions": versions,
-        "files_sha256": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in suite.files.items()},
+        "files_sha256": files_sha256(config),
     }
+
+
+def files_sha256(config: ExperimentConfig) -> dict[str, str]:
+    """SHA-256 of the suite's files and of the modules of all classes from outside the package, by a short name."""
+    files = dict(suite_of(config.tasks).files)
+    for plugin in (config.network.neuron, config.network.encoding, config.switching.policy):
+        path = plugin_file(plugin) if is_plugin(plugin) else None
+        if path is not None and path.is_file():
+            files[plugin.partition(":")[0]] = path
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
 
 
 def command_line() -> str:

@@ -1,6 +1,6 @@
 """The run folder: the only product of training, and all that every other command needs.
 
-config.yaml  environment.json  metrics.jsonl  episodes.csv  switches.csv  checkpoints/  evaluations/
+config.yaml  environment.json  code_changes.jsonl  metrics.jsonl  episodes.csv  switches.csv  checkpoints/  evaluations/
 """
 
 from __future__ import annotations
@@ -107,6 +107,28 @@ class RunFolder:
             write_atomically(self.path / "environment.json", json.dumps(environment, indent=1).encode())
         except OSError as error:
             raise RunFolderError(_unwritable(self.path, error)) from error
+
+    def changed_files(self, files_sha256: dict[str, str], step: int) -> list[str]:
+        """Names of files that changed since the run last went on; the new hashes are added to ``code_changes.jsonl``.
+
+        Args:
+            files_sha256: of today's files, as in environment.json. A file that the run does not know yet is recorded
+                without being named.
+            step: at which the run goes on.
+        """
+        path = self.path / "code_changes.jsonl"
+        try:
+            known = dict(json.loads((self.path / "environment.json").read_bytes()).get("files_sha256", {}))
+            rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+            for row in rows:
+                known |= row["files_sha256"]
+            new = {name: digest for name, digest in files_sha256.items() if known.get(name) != digest}
+            if new:
+                rows.append({"step": step, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "files_sha256": new})
+                write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+        except (ValueError, TypeError, KeyError) as error:
+            raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected JSON lines; delete it") from error
+        return [name for name in new if name in known]
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Replace the stored config (a raised step budget)."""

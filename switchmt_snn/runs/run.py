@@ -25,7 +25,8 @@ from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
-from switchmt_snn.runs.environment import describe_environment
+from switchmt_snn.runs.checkpoint import fitting_weights
+from switchmt_snn.runs.environment import describe_environment, files_sha256
 from switchmt_snn.runs.folder import RunFolder, check_same_config, latest_run, new_run_path
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.plan import decide, plan
@@ -242,8 +243,16 @@ class _Driver:
         if not self.store.paths():
             return None, None, []
         loaded = self.store.load(self.training.replays)
-        self.training.load_state_dict(loaded.state)
+        with fitting_weights():
+            self.training.load_state_dict(loaded.state)
         notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]
+        changed = self.folder.changed_files(files_sha256(self.config), loaded.step)
+        if changed:
+            notes.append(
+                f"warning: the code of {', '.join(changed)} changed since the run last went on; it continues from step "
+                f"{loaded.step:,} with the new code, so its numbers before and after may not belong together "
+                "(code_changes.jsonl)"
+            )
         if not self.training.reproducible:
             notes.append(
                 "the environment did not repeat its running episodes from seed and actions; the run goes on, but not "
@@ -354,7 +363,8 @@ def load_agent(
     suite = make_suite(config.tasks)
     step, weights, _ = folder.checkpoints().load_model(checkpoint)
     network = build_network(config.network, observation_spec(suite), config.seed)
-    network.load_state_dict(weights)
+    with fitting_weights():
+        network.load_state_dict(weights)
     return Agent(network, suite, config, select_device(device), step)
 
 
