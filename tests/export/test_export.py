@@ -300,6 +300,8 @@ def test_a_neuron_from_outside_is_refused_by_every_writer_with_its_name() -> Non
 class Unknown(NeuronLayer):
     """Fires whenever its input is positive."""
 
+    STATE = ()
+
     def step(self, current_t: torch.Tensor, state: NeuronState) -> tuple[torch.Tensor, NeuronState]:
         """One step without a state."""
         return self.surrogate(current_t), state
