@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from switchmt_snn.errors import CheckpointError
+from switchmt_snn.errors import CheckpointError, ConfigError
 
 
 class Stateful:
@@ -42,6 +42,33 @@ class Stateful:
             )
         for name in self.SAVED:
             setattr(self, name, _unpacked(getattr(self, name), state[name]))
+
+
+def require_storable(value: Any, name: str) -> None:
+    """Refuse a part of a state that would not come back from a checkpoint as it was.
+
+    Args:
+        value: from ``Stateful.state_dict``.
+        name: what it is, for the error.
+
+    Raises:
+        ConfigError: naming the value's place and type.
+    """
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise ConfigError(
+                    f"{name} has the key {key!r}, expected keys that are texts; a checkpoint gives texts back"
+                )
+            require_storable(item, f"{name}[{key!r}]")
+    elif isinstance(value, (list, tuple)):
+        for index, item in enumerate(value):
+            require_storable(item, f"{name}[{index}]")
+    elif not (value is None or isinstance(value, (bool, int, float, str, np.ndarray, torch.Tensor))):
+        raise ConfigError(
+            f"{name} is a {type(value).__name__}, expected what a checkpoint can hold: a number, a text, a list or "
+            "dict of such, an array, a tensor or a random generator; an int(...) or float(...) of a NumPy number is one"
+        )
 
 
 def _packed(value: Any) -> Any:

@@ -19,7 +19,9 @@ from typing import Any
 import torch
 
 from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.switching import check_policy
 from switchmt_snn.machine.devices import has_bfloat16, select_device
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
@@ -63,13 +65,15 @@ def plan(
         device: where the network will be; None takes the one that the config asks for.
 
     Raises:
-        ConfigError: the machine does not have the device or engine that is asked for, the batch cannot be divided, or
-            the run does not fit into memory.
+        ConfigError: the machine does not have the device or engine that is asked for, the batch cannot be divided, the
+            run does not fit into memory, or a class from outside the package does not do what it must.
         TaskError: a task does not exist or cannot be learned by a Q-network.
     """
     config = resolve(config)
     if device is None:
         device = select_device(config.device)
+    if is_plugin(config.switching.policy):
+        check_policy(config.switching)
     suite = make_suite(config.tasks)
     config, notes = decide(config, stored, suite, device, processes)
     _require_lives(config)

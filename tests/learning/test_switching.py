@@ -24,6 +24,7 @@ from switchmt_snn.learning.switching import (
     SwitchingPolicy,
     SwitchTo,
     Verdict,
+    check_policy,
     register_criterion,
 )
 from switchmt_snn.learning.switching.parameter_change import relative_change
@@ -292,6 +293,85 @@ def test_what_a_criterion_does_not_declare_is_refused_when_it_shows() -> None:
     policy.end_of_episode(record(1, 1, torch.ones(1), value=3.0))
     with pytest.raises(ConfigError, match="LateAttribute has the attribute 'visits'"):
         policy.state_dict()
+
+
+class TruthValue(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return True  # type: ignore[return-value]
+
+
+class Nothing(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return None  # type: ignore[return-value]
+
+
+class NoReason(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return Verdict(True, {}, {})  # type: ignore[arg-type]
+
+
+class WordMeasured(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return Verdict(False, "never", {"mean_return": "high"})  # type: ignore[dict-item]
+
+
+class Fails(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return Verdict(record.reward > 1, "never", {})  # type: ignore[attr-defined]
+
+
+class FailsInSecondVisit(ReturnAbove):
+    def start_visit(self) -> None:
+        self.returns = None  # type: ignore[assignment]
+
+
+class SavesSet(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        self.returns = {record.episode_return}  # type: ignore[assignment]
+        return Verdict(False, "never", {})
+
+
+class SavesNumbersAsKeys(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        self.returns = {record.task: 1.0}  # type: ignore[assignment]
+        return Verdict(False, "never", {})
+
+
+class WithoutConfig(ReturnAbove):
+    def __init__(self, bound: float) -> None:
+        super().__init__(SwitchingConfig(), bound)
+
+
+@pytest.mark.parametrize(
+    ("criterion", "complaint"),
+    [
+        (TruthValue, r"TruthValue returned True from end_of_episode, expected Verdict\(leave"),
+        (Nothing, "Nothing returned None from end_of_episode"),
+        (NoReason, "expected leave True or False, reason a text"),
+        (WordMeasured, "WordMeasured measured 'mean_return' as 'high', expected a number"),
+        (Fails, r"fails in end_of_episode \(AttributeError: 'EpisodeRecord' .* at test_switching.py, line"),
+        (FailsInSecondVisit, r"fails in end_of_episode \(AttributeError: 'NoneType'"),
+        (SavesSet, "SavesSet.returns is a set, expected what a checkpoint can hold"),
+        (SavesNumbersAsKeys, "SavesNumbersAsKeys.returns has the key 0, expected keys that are texts"),
+        (WithoutConfig, r"whose constructor takes \(bound: .*expected __init__\(self, config, ...\)"),
+    ],
+)
+def test_a_mistake_in_a_criterion_shows_before_training(criterion: type, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        check_policy(SwitchingConfig(policy=f"{__name__}:{criterion.__name__}", options=("bound=2",)))  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_every_whole_criterion_passes_the_check() -> None:
+    check_policy(SwitchingConfig(policy=f"{__name__}:ReturnAbove", options=("bound=2",)))  # type: ignore[arg-type]
+    for name in CRITERIA:
+        check_policy(SwitchingConfig(policy=name))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("option", ["bound=two", "bound=true"])
+def test_an_option_of_another_type_than_its_parameter_is_refused(option: str) -> None:
+    with pytest.raises(ConfigError, match=r"switching.options has bound=.*, expected a number, as its default 1.0"):
+        own(ReturnAbove, options=(option,))
 
 
 def test_wrong_options_are_refused() -> None:

@@ -28,6 +28,7 @@ from switchmt_snn.learning.switching import (
     reward_plateau,
 )
 from switchmt_snn.learning.switching.bounds import Stay, SwitchingPolicy, SwitchTo
+from switchmt_snn.learning.switching.check import check_policy
 from switchmt_snn.learning.switching.criterion import (
     CRITERIA,
     DECISION_COLUMNS,
@@ -48,6 +49,7 @@ __all__ = [
     "SwitchTo",
     "SwitchingPolicy",
     "Verdict",
+    "check_policy",
     "criterion_class",
     "fixed_episodes",
     "fixed_steps",

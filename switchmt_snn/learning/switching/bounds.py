@@ -5,12 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.learning.state import Stateful
-from switchmt_snn.learning.switching.criterion import EpisodeRecord, Verdict, check_state, make_criterion
+from switchmt_snn.learning.state import Stateful, require_storable
+from switchmt_snn.learning.switching.criterion import (
+    EpisodeRecord,
+    Verdict,
+    check_state,
+    criterion_code,
+    make_criterion,
+)
 
 
 @dataclass(frozen=True)
@@ -68,11 +75,12 @@ class SwitchingPolicy(Stateful):
 
         Raises:
             ConfigError: the criterion reports a number that it does not declare in ``columns``, or asks for parameters
-                although it declares no ``snapshots``.
+                although it declares no ``snapshots``; one from outside the package fails, or returns no ``Verdict``.
         """
         if self.criterion.snapshots(self.config) == 0:
             record = replace(record, parameters=self._undeclared_snapshot)
-        verdict = self.criterion.end_of_episode(record)
+        with criterion_code(self.config.policy, "end_of_episode"):
+            verdict = self.criterion.end_of_episode(record)
         measured = self._checked(verdict)
         if self.must_leave(record.steps_in_visit):
             return self._next(record.task, "max_stay_steps", measured)
@@ -101,25 +109,52 @@ class SwitchingPolicy(Stateful):
         """The criterion's state.
 
         Raises:
-            ConfigError: the criterion has an attribute that a resume would lose.
+            ConfigError: the criterion has an attribute that a resume would lose, or that a checkpoint cannot hold.
         """
         check_state(self.criterion)
-        return super().state_dict()
+        state = super().state_dict()
+        for name, value in state["criterion"].items():
+            require_storable(value, f"{type(self.criterion).__name__}.{name}")
+        return state
 
     def _next(self, task: int, reason: str, measured: dict[str, float]) -> SwitchTo:
         """i <- (i + 1) mod |E|, H_i <- []."""
-        self.criterion.start_visit()
+        with criterion_code(self.config.policy, "start_visit"):
+            self.criterion.start_visit()
         return SwitchTo((task + 1) % self.num_tasks, reason, measured)
 
     def _checked(self, verdict: Verdict) -> dict[str, float]:
         """The measured numbers, each of which has a column."""
+        name = type(self.criterion).__name__
+        if not isinstance(verdict, Verdict):
+            raise ConfigError(
+                f"criterion {name} returned {verdict!r} from end_of_episode, expected Verdict(leave, reason, measured)"
+            )
+        if not (
+            isinstance(verdict.leave, (bool, np.bool_))
+            and isinstance(verdict.reason, str)
+            and isinstance(verdict.measured, dict)
+        ):
+            raise ConfigError(
+                f"criterion {name} returned {verdict}, expected leave True or False, reason a text, and measured a dict"
+            )
         for name in verdict.measured:
             if name not in self.columns:
                 raise ConfigError(
                     f"criterion {type(self.criterion).__name__} measured {name!r}, expected one of its columns "
                     f"({', '.join(self.columns) or 'none'}); add {name!r} to {type(self.criterion).__name__}.columns"
                 )
-        return {name: float(value) for name, value in verdict.measured.items()}
+        return {name: self._number(name, value) for name, value in verdict.measured.items()}
+
+    def _number(self, column: str, value: Any) -> float:
+        try:
+            if not isinstance(value, str):
+                return float(value)
+        except (TypeError, ValueError, RuntimeError):
+            pass
+        raise ConfigError(
+            f"criterion {type(self.criterion).__name__} measured {column!r} as {value!r}, expected a number"
+        )
 
     def _undeclared_snapshot(self) -> Tensor:
         name = type(self.criterion).__name__

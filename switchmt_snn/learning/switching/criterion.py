@@ -7,15 +7,16 @@ must know: the columns of switches.csv, the memory it takes, the line on the scr
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor
 
 from switchmt_snn.config import POLICIES, SwitchingConfig
-from switchmt_snn.config.plugins import is_plugin, load_plugin, plugin_options
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.config.plugins import failure, is_plugin, load_plugin, plugin_options
+from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.learning.state import Stateful
 
 DECISION_COLUMNS = (
@@ -175,20 +176,65 @@ def make_criterion(config: SwitchingConfig) -> Criterion:
     """The criterion of a resolved config, with its options.
 
     Raises:
-        ConfigError: an unknown policy, an option that the class does not take, or state that a resume would lose.
+        ConfigError: an unknown policy, a constructor that takes no config or fails, an option that the class does not
+            take or that has another type, or state that a resume would lose.
     """
     cls = criterion_class(config.policy)
     options = plugin_options(config.options, "switching.options")
-    known = list(inspect.signature(cls).parameters)[1:]
+    parameters = list(inspect.signature(cls).parameters.values())
+    if not parameters or parameters[0].name in options or parameters[0].default is not inspect.Parameter.empty:
+        raise ConfigError(
+            f"switching.policy is {config.policy!r}, whose constructor takes {inspect.signature(cls)}, expected "
+            "__init__(self, config, ...): the settings under switching come first, then the options"
+        )
+    known = [parameter.name for parameter in parameters[1:]]
     for name in options:
         if name not in known:
             raise ConfigError(
                 f"switching.options has {name!r}, expected keyword arguments of {cls.__name__}"
                 f"{did_you_mean(name, known) if known else ' (it has none)'}"
             )
-    criterion = cls(config, **options)
+    for parameter in parameters[1:]:
+        if parameter.name in options:
+            _require_kind(parameter, options[parameter.name])
+    with criterion_code(config.policy, "its constructor"):
+        criterion = cls(config, **options)
     check_state(criterion)
     return criterion
+
+
+@contextmanager
+def criterion_code(policy: str, where: str) -> Iterator[None]:
+    """Around a call of a criterion: what a class from outside the package raises becomes one line.
+
+    Raises:
+        ConfigError: naming the class and the line of its code.
+    """
+    try:
+        yield
+    except SwitchMTError:
+        raise
+    except Exception as error:
+        if not is_plugin(policy):
+            raise
+        raise ConfigError(
+            f"switching.policy is {policy!r}, which fails in {where} ({failure(error)}), expected no error; mend it"
+        ) from error
+
+
+def _require_kind(parameter: inspect.Parameter, value: Any) -> None:
+    """Refuse an option of another type than its annotation, or, without a plain one, than its default."""
+    kinds: dict[Any, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
+    stated = {"bool": bool, "int": int, "float": float, "str": str}.get(parameter.annotation, parameter.annotation)
+    allowed = kinds.get(stated)
+    if allowed is None and stated is inspect.Parameter.empty:
+        default = type(parameter.default)
+        allowed = kinds.get(float if default is int else default)
+    if allowed is None or (isinstance(value, allowed) and (bool in allowed or not isinstance(value, bool))):
+        return
+    shown = "" if parameter.default is inspect.Parameter.empty else f", as its default {parameter.default!r}"
+    expected = "a number" if allowed == (int, float) else f"a value of type {allowed[0].__name__}"
+    raise ConfigError(f"switching.options has {parameter.name}={value!r}, expected {expected}{shown}")
 
 
 def check_state(criterion: Criterion) -> None:
