@@ -19,7 +19,7 @@ from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.measuring import layer_health
+from switchmt_snn.learning.measuring import layer_health, updates_to_settle
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
@@ -258,13 +258,16 @@ class Training(Stateful):
     def measure(self) -> Measured:
         """Means since the last report and the health of every neuron layer on the current task.
 
+        Health is left out until the task's running statistics have left their initial values.
+
         Raises:
             TrainingFailed: a loss or a parameter is not finite.
         """
         self.check_finite()
         means = self.learner.take_means()
-        replay = self.replays[self.task]
-        layers = {} if self.is_warming_up(self.task) else layer_health(self.learner, replay, self.task)
+        replay, layers = self.replays[self.task], {}
+        if self._updates_while_played(self.task) >= updates_to_settle(self.learner.network):
+            layers = layer_health(self.learner, replay, self.task, self.steps)
         return Measured(
             step=self.steps,
             task=self.task,
@@ -274,6 +277,12 @@ class Training(Stateful):
             steps_by_task=tuple(self.steps_by_task),
             layers=layers,
         )
+
+    def _updates_while_played(self, task: int) -> int:
+        """About how many updates a task has had in its own steps; -1 while it is warming up."""
+        learning = self.config.learning
+        steps = self.replays[task].transitions_added - learning.learning_starts_steps
+        return -1 if steps < 0 else steps // learning.update_every_steps * learning.updates_per_round
 
     def check_finite(self) -> None:
         """Raise TrainingFailed if a loss or a parameter is not finite; a checkpoint never holds such a network."""

@@ -66,7 +66,7 @@ class Progress:
             self._returns[event.task].append(event.episode_return)
         elif isinstance(event, Measured):
             self._loss, self._q = event.loss, event.q
-            self._warnings = health_warnings(event)
+            self._warnings = health_warnings(event, self._training.config.network)
         elif isinstance(event, SwitchDecided):
             self._distance = _distance(event)
 

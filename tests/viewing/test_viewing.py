@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from switchmt_snn.config import resolve
+from switchmt_snn.config import NetworkConfig, resolve
 from switchmt_snn.config.yaml_io import load_config
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.events import LayerHealth, Measured
@@ -18,7 +18,7 @@ def measured(q: float = 1.0, dead: float = 0.1, saturated: float = 0.1) -> Measu
 
 
 def test_a_healthy_run_says_nothing() -> None:
-    assert health_warnings(measured()) == []
+    assert health_warnings(measured(), NetworkConfig()) == []
 
 
 @pytest.mark.parametrize(
@@ -30,9 +30,18 @@ def test_a_healthy_run_says_nothing() -> None:
     ],
 )
 def test_trouble_is_named_with_a_remedy(trouble: Measured, words: list[str]) -> None:
-    (warning,) = health_warnings(trouble)
+    (warning,) = health_warnings(trouble, NetworkConfig())
     for word in words:
         assert word in warning
+
+
+@pytest.mark.parametrize("stream", ["q", "value", "advantage"])
+def test_silent_streams_are_told_the_setting_that_helps_them(stream: str) -> None:
+    silent = Measured(100, 0, 10, 0.1, 1.0, (100,), {stream: LayerHealth(0.0, 1.0, 0.0)})
+    (warning,) = health_warnings(silent, NetworkConfig())
+    assert warning == f"layer {stream}: 100% of the neurons never fire; use network.stream_normalization=batch"
+    (warning,) = health_warnings(silent, NetworkConfig(stream_normalization="batch", stream_current_thresholds=0.5))
+    assert warning.endswith("never fire; raise network.stream_current_thresholds (now 0.5)")
 
 
 def test_a_run_that_does_not_fit_is_refused_with_numbers() -> None:
