@@ -26,6 +26,8 @@ from switchmt_snn.machine.devices import has_bfloat16, select_device
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.memory import MemoryEstimate, require_gpu_memory, require_memory
+from switchmt_snn.spiking.encodings import try_encoding
+from switchmt_snn.tasks.check import check_before_training
 from switchmt_snn.tasks.registry import make_suite, suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 from switchmt_snn.updates.engine import ENGINES
@@ -75,6 +77,9 @@ def plan(
     if is_plugin(config.switching.policy):
         check_policy(config.switching)
     suite = make_suite(config.tasks)
+    check_before_training(config.tasks, suite)
+    if is_plugin(config.network.encoding):
+        try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)
     config, notes = decide(config, stored, suite, device, processes)
     _require_lives(config)
     memory = describe_method(config, suite).memory

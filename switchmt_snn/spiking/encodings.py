@@ -16,8 +16,8 @@ from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.network import ENCODING_NAMES
-from switchmt_snn.config.plugins import is_plugin, load_plugin
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.config.plugins import failure, is_plugin, load_plugin
+from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 
 
 class Encoding:
@@ -73,6 +73,10 @@ class Encoding:
         inputs = self.encode(x, generator)
         steps = 1 if self.constant_over_time else self.timesteps
         shape = (steps, x.shape[0], self.channels(x.shape[1], self.frame_stack), *x.shape[2:])
+        if not isinstance(inputs, Tensor):
+            raise ConfigError(
+                f"encoding {type(self).__name__} gave {inputs!r} from encode, expected a tensor of shape {shape}"
+            )
         if inputs.shape != shape or inputs.dtype != x.dtype:
             raise ConfigError(
                 f"encoding {type(self).__name__} gave {inputs.dtype} of shape {tuple(inputs.shape)}, expected "
@@ -171,6 +175,38 @@ def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) 
             f"tasks.frame_stack {frame_stack}"
         )
     return cls(config, frame_stack)
+
+
+def try_encoding(config: NetworkConfig, shape: tuple[int, ...], frame_stack: int, in_unit_range: bool) -> None:
+    """Encode two made-up observations, so that a mistake in a class from outside shows before training.
+
+    Args:
+        config: names the encoding.
+        shape: of one stacked observation.
+        frame_stack: frames k in it.
+        in_unit_range: whether scaled observations have values in [0, 1].
+
+    Raises:
+        ConfigError: ``encode`` fails, or gives something else than the class states.
+    """
+    encoding = make_encoding(config, frame_stack, in_unit_range)
+    generator = torch.Generator().manual_seed(0)
+    observations = torch.rand((2, *shape), generator=generator)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            inputs = encoding(observations, generator)
+    except SwitchMTError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f"network.encoding is {config.encoding!r}, which fails in encode ({failure(error)}), expected inputs for "
+            f"observations of shape {tuple(observations.shape)}"
+        ) from error
+    if encoding.makes_spikes and not bool(((inputs == 0) | (inputs == 1)).all()):
+        raise ConfigError(
+            f"network.encoding is {config.encoding!r}, which gives values from {inputs.min():g} to {inputs.max():g}, "
+            "expected 0 and 1 only, as its makes_spikes = True says"
+        )
 
 
 @register_encoding("direct")

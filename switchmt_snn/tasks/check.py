@@ -2,21 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.errors import TaskError
+from switchmt_snn.config import TasksConfig
+from switchmt_snn.config.plugins import failure, is_plugin
+from switchmt_snn.errors import SwitchMTError, TaskError
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
+
+METHODS = {
+    "reset": "reset(env_ids, seeds) -> frames; of a Gymnasium environment, reset(seed=...) -> (observation, info)",
+    "step": "step(actions) -> VectorStep; of a Gymnasium environment, step(action) -> (observation, reward, "
+    "terminated, truncated, info)",
+    "close": "close()",
+}
+"""What environments must have, in words."""
+
+STEPS_BEFORE_TRAINING = 20
+"""Steps per task for which tasks from outside are played before a run starts."""
+
+
+def check_before_training(config: TasksConfig, tasks: TaskSuite) -> None:
+    """Play tasks from outside the package for a few steps: a suite as ``check_suite`` does, Gymnasium's once.
+
+    Args:
+        config: names the suite.
+        tasks: what ``make_suite(config)`` returned.
+
+    Raises:
+        TaskError: naming the task, what was seen, and what was expected.
+    """
+    if is_plugin(config.suite):
+        check_suite(tasks, STEPS_BEFORE_TRAINING)
+    elif config.suite == "gym":
+        checked = replace(tasks, make=lambda task, num_envs: _Checked(tasks, task, num_envs))
+        for task in range(len(tasks.names)):
+            _played(checked, task, STEPS_BEFORE_TRAINING)
 
 
 def check_suite(tasks: TaskSuite, steps: int = 200) -> None:
     """Play every task at random in two copies, twice, and compare the play with the suite's facts.
 
-    Checked: shape and dtype of frames, the range of scaled frames, every valid action is taken, and an episode is the
-    same again for the same seed and the same actions, which exact resume needs.
+    Checked: the environments have ``num_envs`` and every method; rewards and ends have a value per copy; shape and
+    dtype of frames; the range of scaled frames; every valid action is taken; and an episode is the same again for the
+    same seed and the same actions, which exact resume needs.
 
     Args:
         tasks: what ``make_suite(config)`` returned.
@@ -41,16 +75,36 @@ class _Checked:
 
     def __init__(self, tasks: TaskSuite, task: int, num_envs: int) -> None:
         self.num_envs = num_envs
-        self._tasks, self._name, self._environment = tasks, tasks.names[task], tasks.make(task, num_envs)
+        self._tasks, self._name = tasks, tasks.names[task]
+        with self._code("make", "make(task, num_envs) -> the copies of a task"):
+            self._environment = tasks.make(task, num_envs)
+        seen = f"task {self._name!r} is played by {type(self._environment).__name__}, which has"
+        for method, expected in METHODS.items():
+            if not callable(getattr(self._environment, method, None)):
+                raise TaskError(f"{seen} no {method}, expected {expected}")
+        count = getattr(self._environment, "num_envs", None)
+        if count != num_envs:
+            raise TaskError(f"{seen} num_envs {count!r}, expected the {num_envs} that make was asked for")
 
     def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> Frames:
-        frames = self._environment.reset(env_ids, seeds)
+        with self._code("reset", METHODS["reset"]):
+            frames = self._environment.reset(env_ids, seeds)
         self._require_frames(frames, len(env_ids))
         return frames
 
     def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
-        result = self._environment.step(actions)
+        with self._code("step", METHODS["step"]):
+            result = self._environment.step(actions)
+        if not isinstance(result, VectorStep):
+            raise TaskError(f"task {self._name!r} gave a {type(result).__name__} from step, expected a VectorStep")
         self._require_frames(result.frames, self.num_envs)
+        for name, kinds in (("rewards", "fiu"), ("terminated", "b"), ("truncated", "b")):
+            values = getattr(result, name)
+            if np.shape(values) != (self.num_envs,) or np.asarray(values).dtype.kind not in kinds:
+                raise TaskError(
+                    f"task {self._name!r} gave {name} = {values!r}, expected an array of {self.num_envs} "
+                    f"{'truth values' if kinds == 'b' else 'numbers'}, one for each copy"
+                )
         if not np.isfinite(result.rewards).all():
             raise TaskError(f"task {self._name!r} gave the rewards {result.rewards}, expected finite ones")
         return result
@@ -58,7 +112,19 @@ class _Checked:
     def close(self) -> None:
         self._environment.close()
 
+    @contextmanager
+    def _code(self, where: str, expected: str) -> Iterator[None]:
+        """Around a call of code from outside: what it raises becomes one line."""
+        try:
+            yield
+        except SwitchMTError:
+            raise
+        except Exception as error:
+            raise TaskError(f"task {self._name!r} fails in {where} ({failure(error)}), expected {expected}") from error
+
     def _require_frames(self, frames: Frames, count: int) -> None:
+        if not isinstance(frames, np.ndarray):
+            raise TaskError(f"task {self._name!r} gave a {type(frames).__name__} as frames, expected an array")
         tasks, shape = self._tasks, (count, *self._tasks.frame_shape)
         dtype = np.dtype(tasks.frame_dtype)
         if (frames.shape, frames.dtype) != (shape, dtype):

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.config import resolved_frame_stack
-from switchmt_snn.config.plugins import import_plugin_module
+from switchmt_snn.config.plugins import failure, import_plugin_module
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError, did_you_mean
 from switchmt_snn.tasks.suite import Frames, Suite, TaskEnvironment, TaskSuite, VectorStep
@@ -54,7 +54,7 @@ class GymCopies:
             if self._before_reset is not None:
                 self._before_reset(env)
             observation, _ = env.reset(seed=int(seed))
-            self._place(frames[row], observation)
+            self._place(frames[row], observation, env)
         return frames
 
     def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
@@ -65,10 +65,16 @@ class GymCopies:
         for i, env in enumerate(self._envs):
             observation, reward, terminated[i], truncated[i], _ = env.step(int(actions[i]) + self._first_action)
             rewards[i] = float(reward)
-            self._place(frames[i], observation)
+            self._place(frames[i], observation, env)
         return VectorStep(frames, rewards, terminated, truncated)
 
-    def _place(self, target: npt.NDArray[Any], observation: Any) -> None:
+    def _place(self, target: npt.NDArray[Any], observation: Any, env: Env) -> None:
+        declared = env.observation_space.shape
+        if np.shape(observation) != declared:
+            raise TaskError(
+                f"the environment {env.unwrapped!r} gave an observation of shape {np.shape(observation)}, expected "
+                f"{declared}, the shape of its observation_space"
+            )
         frame = self._to_frame(observation)
         target[tuple(slice(0, side) for side in frame.shape)] = frame
 
@@ -178,6 +184,30 @@ def _make_env(name: str) -> Env:
         raise TaskError(f"task {name!r} needs a package that is not installed ({error})") from error
     except ImportError as error:
         raise TaskError(f"task {name!r} cannot be made ({error}), expected all its packages; install them") from error
-    except (gymnasium.error.Error, ValueError) as error:
-        hint = did_you_mean(name, [f"{module}:{known}" if colon else known for known in gymnasium.registry])
-        raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{hint}") from error
+    except gymnasium.error.UnregisteredEnv as error:
+        raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{_hint(name)}") from error
+    except Exception as error:  # whatever the environment's own code raises
+        raise TaskError(
+            f"task {name!r} cannot be made ({failure(error)}), expected a Gymnasium environment with observation_space "
+            "and action_space"
+        ) from error
+
+
+def _hint(name: str) -> str:
+    """Near ids: after ``module:``, of those whose class lies in the module."""
+    module, colon, _ = name.partition(":")
+    if not colon:
+        return did_you_mean(name, gymnasium.registry)
+    own = [
+        f"{module}:{env_id}"
+        for env_id, spec in gymnasium.registry.items()
+        if (
+            spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
+        ).partition(":")[0]
+        == module
+    ]
+    return (
+        did_you_mean(name, own)
+        if own
+        else f"; {module!r} registers none of its classes; call gymnasium.register(id, MyEnv, max_episode_steps=...)"
+    )

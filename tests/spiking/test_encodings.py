@@ -11,7 +11,7 @@ from torch import Tensor
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.network import ENCODING_NAMES
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.spiking.encodings import ENCODINGS, Encoding, make_encoding, register_encoding
+from switchmt_snn.spiking.encodings import ENCODINGS, Encoding, make_encoding, register_encoding, try_encoding
 
 
 def encoder(encoding: str, timesteps: int, stack: int = 1) -> Encoding:
@@ -163,3 +163,41 @@ def test_a_registered_name_is_one_that_the_config_takes_and_that_is_free() -> No
         register_encoding("inverted")(Inverted)
     with pytest.raises(ConfigError, match="'rate' is Rate, expected a name that is free"):
         register_encoding("rate")(Inverted)
+
+
+class GivesNothing(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return None  # type: ignore[return-value]
+
+
+class FailsToEncode(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x * self.gain  # type: ignore[attr-defined]
+
+
+class HalfSpikes(Inverted):
+    makes_spikes = True
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return 0.5 * super().encode(x, generator)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "complaint"),
+    [
+        (Inverted, None),
+        (GivesNothing, "gave None from encode, expected a tensor of shape"),
+        (FailsToEncode, r"fails in encode \(AttributeError: .*'gain' at test_encodings.py, line"),
+        (HalfSpikes, "expected 0 and 1 only, as its makes_spikes = True says"),
+    ],
+)
+def test_an_encoding_from_outside_is_tried_before_training(encoding: type, complaint: str | None) -> None:
+    config = NetworkConfig(encoding=f"{__name__}:{encoding.__name__}", timesteps=3)  # type: ignore[arg-type]
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    if complaint is None:
+        try_encoding(config, (4, 5, 5), 2, True)
+    else:
+        with pytest.raises(ConfigError, match=complaint):
+            try_encoding(config, (4, 5, 5), 2, True)
+    assert torch.equal(before, torch.get_rng_state())

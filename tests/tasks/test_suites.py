@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -17,7 +18,7 @@ from switchmt_snn.errors import ConfigError, TaskError
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.check import check_suite
+from switchmt_snn.tasks.check import check_before_training, check_suite
 from switchmt_snn.tasks.registry import SUITES, find_suite, make_suite, register_suite, suite_of
 from switchmt_snn.tasks.suite import Suite, TaskSuite
 from tests.conftest import CountingEnvironment, vector_suite
@@ -208,3 +209,124 @@ def test_check_suite_names_what_an_environment_does_wrong() -> None:
     for tasks, message in wrong:
         with pytest.raises(TaskError, match=message):
             check_suite(tasks, 20)
+
+
+class Wrong(CountingEnvironment):
+    """Counts, and changes what a step returns."""
+
+    def __init__(self, task: int, num_envs: int, **changes: object) -> None:
+        super().__init__(task, num_envs, 5)
+        self.changes = changes
+
+    def step(self, actions):  # type: ignore[no-untyped-def]
+        return replace(super().step(actions), **self.changes)
+
+
+class TupleStep(CountingEnvironment):
+    def step(self, actions):  # type: ignore[no-untyped-def]
+        result = super().step(actions)
+        return result.frames, result.rewards, result.terminated, result.truncated
+
+
+class FailsInStep(CountingEnvironment):
+    def step(self, actions):  # type: ignore[no-untyped-def]
+        return self.nothing
+
+
+class NoClose(CountingEnvironment):
+    close = None  # type: ignore[assignment]
+
+
+class NoReset(CountingEnvironment):
+    reset = None  # type: ignore[assignment]
+
+
+class OtherCount(CountingEnvironment):
+    def __init__(self, task: int, num_envs: int, length: int) -> None:
+        super().__init__(task, num_envs, length)
+        self.num_envs = 7
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda task, n: NoClose(task, n, 5), r"NoClose, which has no close, expected close\(\)"),
+        (lambda task, n: NoReset(task, n, 5), "which has no reset"),
+        (lambda task, n: OtherCount(task, n, 5), "has num_envs 7, expected the 2"),
+        (lambda task, n: TupleStep(task, n, 5), "gave a tuple from step, expected a VectorStep"),
+        (lambda task, n: FailsInStep(task, n, 5), r"fails in step \(AttributeError: .* at test_suites.py, line"),
+        (lambda task, n: Wrong(task, n, rewards=-0.5), "gave rewards = -0.5, expected an array of 2 numbers"),
+        (lambda task, n: Wrong(task, n, terminated=False), "gave terminated = False, expected an array of 2 truth"),
+        (lambda task, n: Wrong(task, n, frames=None), "gave a NoneType as frames"),
+        (lambda task: None, r"fails in make \(TypeError"),
+    ],
+)
+def test_a_mistake_in_an_environment_is_one_line_before_training(make, message, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    config = TasksConfig(suite="tests.tasks.test_suites:Counting", names=("a", "b"))
+    tasks = make_suite(config)
+    check_before_training(config, tasks)
+    with pytest.raises(TaskError, match=message) as caught:
+        check_before_training(config, replace(tasks, make=make))
+    assert "task 'a'" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+class Still(gymnasium.Env):  # type: ignore[type-arg]
+    """Never moves, and ends after some steps."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (3,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        return np.zeros(3, np.float32), 0.0, False, False, {}
+
+
+class ShortFrame(Still):
+    def step(self, action):  # type: ignore[no-untyped-def]
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+class FourValues(Still):
+    def step(self, action):  # type: ignore[no-untyped-def]
+        return np.zeros(3, np.float32), 0.0, False, {}
+
+
+class NoInfo(Still):
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        return np.zeros(3, np.float32)
+
+
+class NoSpace(Still):
+    observation_space = None  # type: ignore[assignment]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        (Still, None),
+        (ShortFrame, r"gave an observation of shape \(2,\), expected \(3,\), the shape of its observation_space"),
+        (FourValues, r"fails in step \(ValueError: .*truncated, info\)"),
+        (NoInfo, r"fails in reset \(ValueError: .*expected reset\(.*\(observation, info\)"),
+        (NoSpace, "observ"),
+    ],
+)
+def test_a_gymnasium_environment_is_compared_with_its_declaration(environment, message, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    name = f"{environment.__name__}-v0"
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+    gymnasium.register(name, environment, max_episode_steps=4)
+    config = TasksConfig(suite="gym", names=(name,))
+    if message is None:
+        check_before_training(config, make_suite(config))
+        return
+    with pytest.raises(TaskError, match=message):
+        check_before_training(config, make_suite(config))
+
+
+def test_a_module_that_registers_nothing_is_told_to() -> None:
+    with pytest.raises(TaskError, match="registers none of its classes"):
+        make_suite(TasksConfig(suite="gym", names=("tests.conftest:Still-v0",)))
