@@ -54,6 +54,14 @@ class ExperimentConfig:
             self.learning.loss,
             f"huber with network.quantiles={self.network.quantiles}",
         )
+        batches = self.learning.reestimate_statistics_batches
+        require(
+            batches == 0 or self.network.normalization == "per_task",
+            "learning.reestimate_statistics_batches",
+            batches,
+            "0 with network.normalization=shared",
+            "the statistics of one task would take the place of all tasks'",
+        )
         goals, names = self.evaluation.stop_at_returns, self.tasks.names
         require(
             len(goals) in (0, len(names)),

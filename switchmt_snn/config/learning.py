@@ -76,6 +76,10 @@ class LearningConfig:
     """Agent steps between two copies of the network into the target network."""
     target_update_every_updates: int | None = None
     """Count these copies in updates, over all tasks: a number takes the place of target_update_every_steps."""
+    reestimate_statistics_batches: int = 0
+    """Estimate BatchNorm's running statistics of a task anew from so many batches of its replay: of Q and Q* when a
+    visit to the task starts, of Q for all tasks before an evaluation and at the end. Later weights have other
+    statistics, and a task that was away looks forgotten without it. 0: off."""
     epsilon_start: float = 1.0
     """Exploration at the first step."""
     epsilon_end: float = 0.1
@@ -121,6 +125,8 @@ class LearningConfig:
             self.learning_starts_steps,
             f"between batch_size ({self.batch_size}) and replay_capacity_steps ({self.replay_capacity_steps})",
         )
+        batches = self.reestimate_statistics_batches
+        require(batches >= 0, "learning.reestimate_statistics_batches", batches, "at least 0")
         for name in ("epsilon_start", "epsilon_end"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"learning.{name}", value, "a probability in [0, 1]")

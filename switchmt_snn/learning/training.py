@@ -6,6 +6,7 @@ save and when to stop; the state is whole whenever a ``Stepped`` event is yielde
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import TrainingFailed
@@ -22,11 +24,13 @@ from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.measuring import layer_health, updates_to_settle
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
+from switchmt_snn.learning.statistics import reestimate_statistics
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
 from switchmt_snn.machine.memory import GIB
+from switchmt_snn.replay.on_device import to_device
 from switchmt_snn.replay.ring import FrameReplay, Returns
 from switchmt_snn.replay.size import compresses_replay
-from switchmt_snn.spiking.network import ObservationSpec, build_network
+from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite, VectorStep
 from switchmt_snn.updates.processes import ProcessGroup
@@ -234,7 +238,38 @@ class Training(Stateful):
         self.task = task
         self.steps_in_visit = 0
         self.episodes_in_visit = 0
+        self._reestimate(task, self.learner.network, self.learner.target)
         self._begin_episodes()
+
+    def reestimate_statistics(self) -> None:
+        """Estimate every task's running statistics anew, if ``learning.reestimate_statistics_batches`` says so.
+
+        The draws depend on the step only, so a second call at a step gives the same statistics.
+        """
+        for task in range(len(self.replays)):
+            self._reestimate(task, self.learner.network)
+
+    def with_fresh_statistics(self) -> QNetwork:
+        """The network as ``reestimate_statistics`` would make it: a copy, or with the setting off the learner's own."""
+        if self.config.learning.reestimate_statistics_batches == 0:
+            return self.learner.network
+        network = copy.deepcopy(self.learner.network)
+        for task in range(len(self.replays)):
+            self._reestimate(task, network)
+        return network
+
+    def _reestimate(self, task: int, *networks: QNetwork) -> None:
+        learning, replay = self.config.learning, self.replays[task]
+        if learning.reestimate_statistics_batches == 0 or self.is_warming_up(task):
+            return
+        rng = np.random.default_rng((self.config.seed, self.steps, task))
+        generator = torch.Generator(self.learner.device).manual_seed(int(rng.integers(2**62)))
+        drawn = (
+            replay.sample(learning.batch_size, rng, Returns()).observations
+            for _ in range(learning.reestimate_statistics_batches)
+        )
+        batches = (x if isinstance(x, Tensor) else to_device(x, self.learner.device) for x in drawn)
+        reestimate_statistics(networks, task, batches, generator)
 
     def _begin_episodes(self) -> None:
         """Start an episode in every copy of the current task that has none."""

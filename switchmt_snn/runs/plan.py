@@ -218,6 +218,12 @@ def _require_divisible(config: ExperimentConfig, processes: int) -> None:
             f"learning.engine is {config.learning.engine!r}, expected eager or auto for the {processes} processes that "
             "torchrun started"
         )
+    batches = config.learning.reestimate_statistics_batches
+    if batches:
+        raise ConfigError(
+            f"learning.reestimate_statistics_batches is {batches}, expected 0 for the {processes} processes that "
+            "torchrun started: only the first one holds the replay"
+        )
     size = config.learning.batch_size
     if size % processes or size // processes < 2:
         raise ConfigError(

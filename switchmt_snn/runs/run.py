@@ -229,6 +229,8 @@ class _Driver:
                         if requested():
                             stopped = training.steps < self.config.total_steps
                             break
+                if not stopped:
+                    training.reestimate_statistics()
                 self._save()
         finally:
             logs.close()
@@ -265,6 +267,7 @@ class _Driver:
         before = step - self.training.num_envs
         every = self.config.evaluation.every_steps
         if every is not None and step // every > before // every and step < self.config.total_steps:
+            self.training.reestimate_statistics()
             evaluation = self._evaluate(self.config.evaluation)
             self.solved = self._is_solved({row.task: row.mean for row in evaluation.tasks if row.policy == "agent"})
         every = self.config.recording.checkpoint_every_steps
@@ -279,7 +282,7 @@ class _Driver:
         score = self._rise()
         best = self.store.best_score()
         if score is not None and (best is None or score > best):
-            self.store.save_best(training.steps, training.learner.network.state_dict(), score)
+            self.store.save_best(training.steps, training.with_fresh_statistics().state_dict(), score)
 
     def _rise(self) -> float | None:
         """Mean over tasks of (newest returns - first returns) / spread of the first; None while episodes are few."""

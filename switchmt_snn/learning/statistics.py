@@ -1,0 +1,50 @@
+"""BatchNorm's running statistics of a task, estimated anew from batches of its replay.
+
+Running statistics follow the weights with a delay, and those of a task that is not trained do not follow at all, while
+the shared weights move on. Then a task looks forgotten that is not. CaRe-BN (ICLR 2026) re-estimates them, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.spiking.normalization import TaskBatchNorm
+
+
+@torch.no_grad()
+def reestimate_statistics(
+    networks: Sequence[QNetwork], task: int, batches: Iterable[Tensor], generator: torch.Generator
+) -> None:
+    """Replace a task's running mean and variance in every BatchNorm by their means over batches.
+
+    Each batch goes through the networks in training mode, in float32. Nothing but these statistics changes.
+
+    Args:
+        networks: each gets the statistics of its own weights.
+        task: task index k.
+        batches: raw observations ``[B, *shape]`` on the networks' device.
+        generator: source of the encoding's random numbers.
+    """
+    for count, observations in enumerate(batches, start=1):
+        for network in networks:
+            with _momentum(network, 1.0 / count):  # the mean over the batches so far
+                inputs = network.encode(observations, generator)
+                network.values(inputs, network.context(task), training=True)
+
+
+@contextmanager
+def _momentum(network: QNetwork, momentum: float) -> Iterator[None]:
+    layers = [module for module in network.modules() if isinstance(module, TaskBatchNorm)]
+    before = [layer.momentum for layer in layers]
+    for layer in layers:
+        layer.momentum = momentum
+    try:
+        yield
+    finally:
+        for layer, kept in zip(layers, before, strict=True):
+            layer.momentum = kept
