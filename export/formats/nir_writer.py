@@ -1,8 +1,9 @@
 """NIR graphs of a folded network: one graph per task, on the nodes that other simulators read.
 
 The graph takes the encoded input of one simulation step and ends at the head's Affine; the host encodes, runs T steps
-and applies the readout (mean: averages the outputs). NIR is continuous in time: ``dt`` is the length of one simulation
-step that makes the discrete network of ``switchmt_snn.spiking.neurons`` out of it by explicit Euler steps.
+and applies the readout (mean: averages the outputs). An action that the task does not have gets a bias so low that it
+is never the largest (``never_choosing_others``). NIR is continuous in time: ``dt`` is the length of one simulation step
+that makes the discrete network of ``switchmt_snn.spiking.neurons`` out of it by explicit Euler steps.
 
 Dialects:
 
@@ -20,7 +21,7 @@ nir.CubaLIF: it resets at the spike, while ``snntorch.Synaptic`` resets after th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -80,7 +81,7 @@ def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable
         export_synapses(layer.synapses, chain, shape, task, gain_O)
         export_neurons(layer.neurons, chain, layer, dialect)
         shape = layer.output_shape
-    export_synapses(network.head, chain, shape, task, np.ones(1, np.float32))
+    export_synapses(never_choosing_others(network, task), chain, shape, task, np.ones(1, np.float32))
     chain.append("output", nir.Output({"output": np.array(network.head.output_shape)}))
     facts = metadata(network) | {
         "task": network.tasks[task],
@@ -89,6 +90,23 @@ def nir_graph(network: FoldedNetwork, task: int, dialect: NirDialect = "portable
         "output": "head current of one step; readout over the T steps is the host's",
     }
     return nir.NIRGraph(chain.nodes, chain.edges, metadata=_storable(facts))
+
+
+def never_choosing_others(network: FoldedNetwork, task: int) -> SynapseNode:
+    """The head with a bias that keeps every action that the task does not have below all that it has.
+
+    NIR has no -inf that importers take. The head hears spikes, so an output is within the sum of its weights' absolute
+    values around its bias at every step, and so is what any readout makes of it.
+    """
+    head, valid_A = network.head, network.valid_actions_KA[task]
+    if valid_A.all():
+        return head
+    weight, bias = head.folded(task)
+    reach_A = np.abs(weight.astype(np.float64)).sum(axis=1)
+    lowest = 2.0 * (reach_A + np.abs(bias))[valid_A].max() + 1.0
+    shift_KO = head.shift_KO.copy()
+    shift_KO[task, ~valid_A] = -(lowest + reach_A[~valid_A])
+    return replace(head, shift_KO=shift_KO)
 
 
 def write_nir(graph: nir.NIRGraph, path: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.export.formats.onnx_graph import FLOAT, Graph
+from switchmt_snn.export.formats.onnx_graph import FLOAT, TASK, Graph
 from switchmt_snn.spiking.layers import Array, Conv, Dense, Layer, NeuronNode, SynapseNode, TaskDense, no_rule
 from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, ReLUNode, SynapticNode
 
@@ -42,7 +42,7 @@ def weights_of(graph: Graph, node: SynapseNode, task: int | None) -> Weights:
     terms = []
     for kind, rows in (("scale", node.scale_KO), ("shift", node.shift_KO)):
         table = graph.constant(f"{name}_{kind}_by_task", rows)
-        row = graph.add("Gather", [table, "task"], f"{name}_{kind}_row", axis=0)
+        row = graph.add("Gather", [table, TASK], f"{name}_{kind}_row", axis=0)
         if len(node.output_shape) == 3:
             axes = graph.constant("image_axes", [2, 3], np.int64)
             row = graph.add("Unsqueeze", [row, axes], f"{name}_{kind}")
@@ -98,7 +98,7 @@ def _(node: TaskDense, graph: Graph, weights: list[str], x: str) -> str:
     every = graph.add("Gemm", [flat, *weights], f"{name}_of_all_tasks", transB=1)
     shape = graph.constant(f"{name}_by_task", [0, -1, node.outputs], np.int64)
     by_task = graph.add("Reshape", [every, shape], f"{name}_tasks")
-    index = graph.add("Unsqueeze", ["task", graph.constant("axis_1", [1], np.int64)], f"{name}_task")
+    index = graph.add("Unsqueeze", [TASK, graph.constant("axis_1", [1], np.int64)], f"{name}_task")
     return graph.add("GatherND", [by_task, index], f"{name}_synapses", batch_dims=1)
 
 

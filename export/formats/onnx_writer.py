@@ -21,11 +21,13 @@ from onnx import helper, numpy_helper
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
 from switchmt_snn.export.formats.onnx_encodings import encode, observation_input
-from switchmt_snn.export.formats.onnx_graph import FLOAT, INT64, OPSET, Graph
+from switchmt_snn.export.formats.onnx_graph import FLOAT, INT64, OPSET, TASK, Graph
 from switchmt_snn.export.formats.onnx_nodes import Weights, export_neurons, export_synapses, weights_of
 from switchmt_snn.spiking.folding import FoldedNetwork
 
 _IR_VERSION = 8
+NEVER_CHOSEN = -(2.0**100)
+"""``q_step`` of an action that the task does not have: finite, so that every readout is a number far below others."""
 
 
 def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelProto:
@@ -39,7 +41,7 @@ def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.Mode
     graph, network = Graph(), network if task is None else network.of_task(task)
     inputs = [observation_input(network)]
     if task is None:
-        inputs.append(helper.make_tensor_value_info("task", INT64, ["batch"]))
+        inputs.append(_task_input(graph, network))
     weights = {node.name: weights_of(graph, node, task) for node in network.synapses}
     encoded = encode(graph, network)
     outputs = [helper.make_tensor_value_info("q_values", FLOAT, ["batch", len(network.actions)])]
@@ -52,7 +54,7 @@ def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.Mode
             current = export_synapses(graph, layer.synapses, weights[layer.name], x)
             x = export_neurons(layer.neurons, graph, layer, current)
         q = export_synapses(graph, network.head, weights["head"], x)
-    _mask(graph, network, q, task)
+    _mask(graph, network, q, task, "q_values", -np.inf)
     return _model(graph, network, "decision", inputs, outputs, task)
 
 
@@ -62,8 +64,8 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
     Inputs are ``encoded`` float32 ``[B, *shape]`` (what the encoding gives for this step; direct: observation x scale),
     ``task`` unless the file is for one, and the state of each neuron layer, zeros at a decision's start:
     ``membrane_<layer>`` and what else its model keeps. Outputs are ``q_step`` ``[B, A]``, the head's output for this
-    step's spikes (the host applies the readout; its mean over T is Q), ``spikes_<layer>``, and each state's next value
-    as ``<state>_<layer>_next``.
+    step's spikes (the host applies the readout; its mean over T is Q; ``NEVER_CHOSEN`` where an action does not exist),
+    ``spikes_<layer>``, and each state's next value as ``<state>_<layer>_next``.
 
     Raises:
         ExportError: the network does not spike.
@@ -73,7 +75,7 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
     graph, network = Graph(), network if task is None else network.of_task(task)
     inputs = [helper.make_tensor_value_info("encoded", FLOAT, ["batch", *network.encoded_shape])]
     if task is None:
-        inputs.append(helper.make_tensor_value_info("task", INT64, ["batch"]))
+        inputs.append(_task_input(graph, network))
     weights = {node.name: weights_of(graph, node, task) for node in network.synapses}
     outputs = [helper.make_tensor_value_info("q_step", FLOAT, ["batch", len(network.actions)])]
     x = "encoded"
@@ -85,7 +87,8 @@ def step_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelPro
         outputs += [helper.make_tensor_value_info(name, FLOAT, shape) for name in given]
         current = export_synapses(graph, layer.synapses, weights[layer.name], x)
         x = export_neurons(layer.neurons, graph, layer, current)
-    graph.add("Identity", [export_synapses(graph, network.head, weights["head"], x)], "q_step")
+    q = export_synapses(graph, network.head, weights["head"], x)
+    _mask(graph, network, q, task, "q_step", NEVER_CHOSEN)
     return _model(graph, network, "step", inputs, outputs, task)
 
 
@@ -180,13 +183,24 @@ def _scan(
     )
 
 
-def _mask(graph: Graph, network: FoldedNetwork, q: str, task: int | None) -> None:
-    """Define ``q_values``: Q, and -inf where the task does not have the action."""
+def _task_input(graph: Graph, network: FoldedNetwork) -> onnx.ValueInfoProto:
+    """The input ``task``. ONNX counts a negative index from the end: it is moved out of range, and refused."""
+    negative = graph.add("Less", ["task", graph.constant("first_task", 0, np.int64)], "task_is_negative")
+    beyond = graph.constant("number_of_tasks", len(network.tasks), np.int64)
+    graph.add("Where", [negative, beyond, "task"], TASK)
+    return helper.make_tensor_value_info("task", INT64, ["batch"])
+
+
+def _mask(graph: Graph, network: FoldedNetwork, q: str, task: int | None, output: str, masked: float) -> None:
+    """Define an output: Q, and another value where the task does not have the action.
+
+    With the input ``task``, the look-up is also what refuses a task that does not exist.
+    """
     valid_KA = network.valid_actions_KA if task is None else network.valid_actions_KA[[task]]
-    if valid_KA.all():
-        graph.add("Identity", [q], "q_values")
+    if task is not None and valid_KA.all():
+        graph.add("Identity", [q], output)
         return
     valid = graph.constant("valid_actions", valid_KA, np.bool_)
     if task is None:
-        valid = graph.add("Gather", [valid, "task"], "valid_here", axis=0)
-    graph.add("Where", [valid, q, graph.constant("impossible", -np.inf)], "q_values")
+        valid = graph.add("Gather", [valid, TASK], "valid_here", axis=0)
+    graph.add("Where", [valid, q, graph.constant("masked", masked)], output)

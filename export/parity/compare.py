@@ -19,7 +19,7 @@ import onnxruntime
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.export.parity.activity import active_neurons, chunks
-from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, existing_only, onnx_session
+from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.spiking.folding import FoldedNetwork
@@ -33,14 +33,16 @@ class Trace:
     """What a batch of decisions did.
 
     Attributes:
-        q_BA: Q-values.
+        q_BA: Q-values, as a host sees them: nothing is masked here.
         spikes: each layer's spikes ``[T, B, N]``, as far as they can be seen (an ANN has none).
         counts: each layer's number of spikes ``[B]``, where a model counts them itself.
+        step_q_BA: Q-values of the same decisions by ``step.onnx``, if there is one.
     """
 
     q_BA: Float
     spikes: dict[str, npt.NDArray[np.bool_]]
     counts: dict[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+    step_q_BA: Float | None = None
 
 
 @dataclass
@@ -90,12 +92,17 @@ class Comparison:
             self.flipped_spikes[name] = self.flipped_spikes.get(name, 0) + int(flips_here_B.sum())
             flips_B += flips_here_B
         exists = np.isfinite(expected.q_BA)
-        difference = np.abs(np.where(exists, expected.q_BA, 0) - np.where(exists, seen.q_BA, 0))
+        equal_q_B, equal_actions_B = (np.ones(len(flips_B), np.bool_) for _ in range(2))
+        for q_BA in (seen.q_BA, seen.step_q_BA):
+            if q_BA is not None:
+                difference = np.abs(np.where(exists, expected.q_BA, 0) - np.where(exists, q_BA, 0))
+                self.largest_q_difference = max(self.largest_q_difference, float(difference.max(initial=0.0)))
+                equal_q_B &= (difference == 0).all(axis=1)
+                equal_actions_B &= expected.q_BA.argmax(axis=1) == q_BA.argmax(axis=1)
         self.decisions += len(flips_B)
         self.decisions_with_flips += int((flips_B > 0).sum())
-        self.largest_q_difference = max(self.largest_q_difference, float(difference.max(initial=0.0)))
-        self.equal_q += int((expected.q_BA == seen.q_BA).all(axis=1).sum())
-        self.equal_actions += int((expected.q_BA.argmax(axis=1) == seen.q_BA.argmax(axis=1)).sum())
+        self.equal_q += int(equal_q_B.sum())
+        self.equal_actions += int(equal_actions_B.sum())
 
     @property
     def bitwise(self) -> bool:
@@ -125,13 +132,12 @@ def trace_torch(agent: Agent, observations: npt.NDArray[Any], task: int, seed: i
     return Trace(activity.q_BA, activity.by_layer if agent.network.spiking else {})
 
 
-def trace_nir(network: FoldedNetwork, graph: nir.NIRGraph, encoded_TB: Float, task: int) -> Trace:
+def trace_nir(network: FoldedNetwork, graph: nir.NIRGraph, encoded_TB: Float) -> Trace:
     """A NIR graph in the reference interpreter."""
     interpreter = NirInterpreter(graph, reset=str(graph.metadata["reset"]))
     names = {layer.name: f"{layer.name}_neurons" for layer in network.layers}
     outputs, recorded = interpreter.run(encoded_TB, list(names.values()))
-    q = existing_only(network.readout(outputs), network.valid_actions_KA[task])
-    return Trace(q, {name: _flat(recorded[node]) > 0 for name, node in names.items()})
+    return Trace(network.readout(outputs), {name: _flat(recorded[node]) > 0 for name, node in names.items()})
 
 
 def trace_onnx(
@@ -142,7 +148,7 @@ def trace_onnx(
     encoded_TB: Float,
     task: int,
 ) -> Trace:
-    """``decision.onnx`` for Q and spike counts, ``step.onnx`` (if given) for every spike."""
+    """``decision.onnx`` for Q and spike counts, ``step.onnx`` (if given) for every spike and Q once more."""
     batch = len(observations)
     tasks_B = np.full(batch, task)
     decided = decision.decide(observations, tasks_B, encoded_TB)
@@ -156,15 +162,18 @@ def trace_onnx(
     }
     states = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     spikes: dict[str, list[npt.NDArray[np.bool_]]] = {layer.name: [] for layer in layers}
+    outputs: list[Float] = []
     names = [value.name for value in step.get_outputs()]
     takes_task = any(value.name == "task" for value in step.get_inputs())
     for encoded_B in encoded_TB:
         fed = {"encoded": np.ascontiguousarray(encoded_B), **states, **({"task": tasks_B} if takes_task else {})}
         out = dict(zip(names, step.run(names, fed), strict=True))
         states = {name: out[f"{name}_next"] for name in states}
+        outputs.append(out["q_step"])
         for name, values in spikes.items():
             values.append(out[f"spikes_{name}"].reshape(batch, -1) > 0)
-    return Trace(decided["q_values"], {name: np.stack(values) for name, values in spikes.items()}, counts)
+    fired = {name: np.stack(values) for name, values in spikes.items()}
+    return Trace(decided["q_values"], fired, counts, network.readout(np.stack(outputs)))
 
 
 def _flat(values_TB: Float) -> Float:
@@ -207,7 +216,7 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
             elif result.runtime == "onnx, one task" and own is not None:
                 result.add(expected, trace_onnx(network, own, None, chunk, encoded_TB, task))
             elif exports.graphs is not None:
-                result.add(expected, trace_nir(network, exports.graphs[name], encoded_TB, task))
+                result.add(expected, trace_nir(network, exports.graphs[name], encoded_TB))
         return results
 
     totals = [Comparison(runtime, name) for runtime in runtimes]

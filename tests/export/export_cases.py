@@ -49,6 +49,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "T 7": {"timesteps": 7},
     "T 1": {"timesteps": 1},
     "k winners": {"k_winners": 9},
+    "missing actions": {"tasks": {"minimal_action_mask": True}},
+    "missing actions, heads per task": {
+        "tasks": {"minimal_action_mask": True},
+        "heads": "per_task",
+        "readout": "max_membrane",
+    },
 }
 
 

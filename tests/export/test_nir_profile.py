@@ -158,7 +158,7 @@ def exported(tmp_path: Path):
 
 
 OWN = ["DSQN", "DSQN_D", "MTSpark_AD", "SwitchMT", "rate", "latency", "frames", "events", "subtract", "LIF"]
-OWN += ["LIF subtract", "Synaptic subtract", "per_neuron", "mlp", "T 7", "T 1", "last_membrane"]
+OWN += ["LIF subtract", "Synaptic subtract", "per_neuron", "mlp", "T 7", "T 1", "last_membrane", "missing actions"]
 
 
 @pytest.mark.slow
