@@ -12,7 +12,7 @@ Dialects:
 - ``spikingjelly``: the same for an importer that requires IF.r = 1 / dt, with its default dt = 1e-4.
 - ``exact``: also reset by subtraction, as a loop: an integrator (I, or LI with its own r), a Threshold, and a Scale by
   minus the threshold back into the integrator, one step later. Synaptic neurons have one more LI for their current.
-- ``legacy``: no ``v_reset`` in the file, so that nir <= 1.0.4 reads it; how a spike resets is in the metadata only.
+- ``legacy``: no ``v_reset`` in the file, so that nir <= 1.0.5 reads it; how a spike resets is in the metadata only.
 
 Each node of the network has one rule: ``export_synapses`` and ``export_neurons`` of this module. A node without a rule
 is refused by name; a neuron from outside the package registers its own (docs/extending.md, Neuron). No dialect uses

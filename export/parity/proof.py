@@ -151,11 +151,16 @@ class _Proof:
         def simulated(task: str, name: str) -> dict[str, Any]:
             simulator, recorded = SIMULATORS[name], exact_inputs[twin.suite.index(task)]
             inputs_TB = encode(twin.suite, twin.config, _spread(recorded, SIMULATOR_DECISIONS), 0)
-            expected, _ = NirInterpreter(graphs[task], **simulator.interpreter).run(inputs_TB)
+            reset = str(graphs[task].metadata["reset"])
+            expected, _ = NirInterpreter(graphs[task], reset=reset, **simulator.interpreter).run(inputs_TB)
             refused, equal = None, False
             try:
                 equal = bool(np.array_equal(expected, simulate(name, graphs[task], inputs_TB)))
-            except (ValueError, NotImplementedError) as error:  # it says itself that it cannot read such a network
+            except (
+                AssertionError,
+                ValueError,
+                NotImplementedError,
+            ) as error:  # it says itself that it cannot read such a network
                 refused = str(error)
             return {
                 "simulator": name,

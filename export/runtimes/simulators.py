@@ -1,19 +1,20 @@
 """Other people's simulators that read NIR files, where they are installed (extra: simulators; sinabs by hand).
 
-Each runs T steps on encoded inputs and returns the graph's output per step; its convention says what the reference
-interpreter must be told to agree bitwise.
+Each runs T steps on encoded inputs and returns the graph's output per step. It says which neurons it runs in which
+dialect, and what the reference interpreter must be told to agree bitwise. docs/deploy.md has all of it as one table.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import io
 import logging
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import nir
 import numpy as np
@@ -27,17 +28,21 @@ _importing = threading.Lock()
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulator and how it reads ``nir.IF``.
+    """A simulator and how it reads a network's neurons.
 
     Attributes:
         modules: what must be importable.
         convention: in words, for reports.
-        interpreter: the matching options of ``NirInterpreter``.
+        neurons: NIR nodes that it runs as NIR defines them, up to the convention.
+        dialects: that it reads (``switchmt_snn.export.formats.nir_writer``).
         run: ``(graph, inputs_TB, dt) -> outputs_TB``.
+        interpreter: the matching options of ``NirInterpreter``, beside the reset of the graph's metadata.
     """
 
     modules: tuple[str, ...]
     convention: str
+    neurons: tuple[type[nir.NIRNode], ...]
+    dialects: tuple[str, ...]
     run: Callable[[nir.NIRGraph, Float, float], Float]
     interpreter: dict[str, Any] = field(default_factory=dict)
 
@@ -65,7 +70,9 @@ def _nirtorch(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
         nir.Affine: _affine,
         nir.Flatten: lambda node: torch.nn.Flatten(0, -1),
         nir.Conv2d: _conv2d,
-        nir.IF: _ImmediateResetIF,
+        nir.Scale: lambda node: _Stateless(node.scale, torch.mul),
+        nir.Threshold: lambda node: _Stateless(node.threshold, lambda x, threshold: (x > threshold).to(x.dtype)),
+        **dict.fromkeys((nir.IF, nir.LIF, nir.I, nir.LI), _Membrane),
     }
     network = nirtorch.nir_to_torch(graph, maps)
     return _one_by_one(lambda x, state: network(x, state), inputs_TB)
@@ -94,7 +101,9 @@ def _sinabs(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
     network = sinabs.nir.from_nir(graph, batch_size=batch)
     for layer in network.modules():
         if isinstance(layer, sinabs.layers.IAFSqueeze):
-            layer.spike_fn = sinabs.activation.SingleSpike
+            layer.spike_fn, layer.min_v_mem = sinabs.activation.SingleSpike, None
+            if graph.metadata["reset"] == "zero":
+                layer.reset_fn = sinabs.activation.MembraneReset()
     with torch.no_grad():
         y = network(torch.from_numpy(inputs_TB.swapaxes(0, 1).reshape(-1, *inputs_TB.shape[2:])))
     y = y[0] if isinstance(y, tuple) else y
@@ -102,40 +111,73 @@ def _sinabs(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
     return outputs
 
 
+def _snntorch(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
+    """Unbatched, as its Flatten(0, -1) asks for; its importer takes dt to be 1e-4, and its neurons keep their state."""
+    with _importing:
+        import snntorch
+        from snntorch.import_nir import import_from_nir
+
+    network = import_from_nir(graph)
+
+    def step(x: torch.Tensor, state: Any) -> tuple[torch.Tensor, Any]:
+        if state is None:
+            for neuron in network.modules():
+                if isinstance(neuron, snntorch.Leaky):
+                    neuron.mem = torch.zeros(0)
+        return cast(tuple[torch.Tensor, Any], network(x, state))
+
+    return _one_by_one(step, inputs_TB)
+
+
+_NOT_RESET_AT_ONCE = (nir.I, nir.LI, nir.Threshold, nir.Scale)
+"""Nodes of the loops that reset by subtraction."""
+_ABOVE, _AT = "fires at v > threshold", "fires at v >= threshold"
+
 SIMULATORS: dict[str, Simulator] = {
-    "norse": Simulator(("norse", "nirtorch"), "reset to zero, fires at v > threshold", _norse),
-    "nirtorch": Simulator(("nirtorch",), "own maps: reset to zero, fires at v > threshold", _nirtorch),
+    "norse": Simulator(("norse", "nirtorch"), f"reset to zero, {_ABOVE}", (nir.IF, nir.LIF), ("portable",), _norse),
+    "nirtorch": Simulator(
+        ("nirtorch",),
+        f"own maps: as NIR says, {_ABOVE}",
+        (nir.IF, nir.LIF, *_NOT_RESET_AT_ONCE),
+        ("portable", "exact"),
+        _nirtorch,
+    ),
     "spikingjelly": Simulator(
         ("spikingjelly",),
-        "reset to zero, fires at v >= threshold",
+        f"reset to zero, {_AT}",
+        (nir.IF, nir.LIF),
+        ("portable", "spikingjelly"),
         _spikingjelly,
         {"fires_at_threshold": True},
     ),
     "sinabs": Simulator(
         ("sinabs", "pbr"),
-        "SingleSpike: resets by subtraction, fires at v >= threshold, membrane not below -threshold",
+        f"SingleSpike, MembraneReset unless the network subtracts, no min_v_mem: {_AT}",
+        (nir.IF,),
+        ("portable", "legacy"),
         _sinabs,
-        {"reset": "subtract", "fires_at_threshold": True, "floor": True},
+        {"fires_at_threshold": True},
     ),
+    "snntorch": Simulator(("snntorch",), f"reset to zero, {_ABOVE}", (nir.LIF,), ("spikingjelly",), _snntorch),
 }
-"""Simulators that are known to read the portable profile."""
+"""Simulators that are known to run a network exactly, up to their conventions."""
 
 
-_COMPARED = (nir.Input, nir.Conv2d, nir.IF, nir.Flatten, nir.Affine, nir.Output)
-"""Nodes on which the importers agree with NIR up to the conventions above."""
+_COMMON = (nir.Input, nir.Conv2d, nir.Flatten, nir.Affine, nir.Output)
+"""Nodes that all of them run as NIR defines them."""
 
 
 def skipped(name: str, graph: nir.NIRGraph) -> str | None:
     """Why a simulator is not compared on a graph; None if it is."""
-    if not SIMULATORS[name].installed:
-        return f"{', '.join(SIMULATORS[name].modules)} not installed"
-    if str(graph.metadata["profile"]) in ("exact", "legacy"):
-        return f"does not take the dialect {graph.metadata['profile']}"
-    others = sorted({type(node).__name__ for node in graph.nodes.values() if not isinstance(node, _COMPARED)})
+    simulator, dialect = SIMULATORS[name], str(graph.metadata["profile"])
+    if not simulator.installed:
+        return f"{', '.join(simulator.modules)} not installed"
+    if dialect not in simulator.dialects:
+        return f"does not take the dialect {dialect}, only {', '.join(simulator.dialects)}"
+    known = (*_COMMON, *simulator.neurons)
+    others = sorted({type(node).__name__ for node in graph.nodes.values() if not isinstance(node, known)})
     if others:
-        return f"importers differ in what {', '.join(others)} means"
-    if name in ("norse", "nirtorch") and float(graph.metadata["dt"]) != 1.0:
-        return f"takes dt 1, not {graph.metadata['dt']}"
+        return f"refuses {', '.join(others)}, or computes something else"
     return None
 
 
@@ -146,8 +188,8 @@ def simulate(name: str, graph: nir.NIRGraph, inputs_TB: Float) -> Float:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Without the simulators' warnings (outside of threads: warning filters belong to the process)."""
-    with warnings.catch_warnings():
+    """Without what the simulators say (outside of threads: filters and streams belong to the process)."""
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         logging.getLogger("torch").setLevel(logging.ERROR)
         yield
@@ -181,14 +223,31 @@ def _with_weights(module: torch.nn.Module, node: Any) -> torch.nn.Module:
     return module
 
 
-class _ImmediateResetIF(torch.nn.Module):
-    """nir.IF as NIR defines it, with dt r = 1."""
+class _Stateless(torch.nn.Module):
+    """A function of the input and of one parameter."""
 
-    def __init__(self, node: nir.IF) -> None:
+    def __init__(self, parameter: Float, function: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
         super().__init__()
-        self.threshold = torch.from_numpy(node.v_threshold)
+        self.parameter, self.function = torch.from_numpy(parameter), function
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.function(x, self.parameter)
+
+
+class _Membrane(torch.nn.Module):
+    """nir.IF, LIF, I and LI as NIR defines them, with dt = 1 and no leak potential."""
+
+    def __init__(self, node: Any) -> None:
+        super().__init__()
+        self.leaky, self.spiking = isinstance(node, (nir.LIF, nir.LI)), isinstance(node, (nir.IF, nir.LIF))
+        self.r = torch.from_numpy(node.r)
+        self.rate = 1.0 / torch.from_numpy(node.tau) if self.leaky else self.r
+        self.threshold = torch.from_numpy(node.v_threshold) if self.spiking else None
 
     def forward(self, x: torch.Tensor, state: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        v = x if state is None else state + x
+        v = torch.zeros_like(x) if state is None else state
+        v = v + self.rate * (self.r * x - v if self.leaky else x)
+        if self.threshold is None:
+            return v, v
         fired = v > self.threshold
         return fired.to(x.dtype), torch.where(fired, torch.zeros_like(v), v)

@@ -26,8 +26,8 @@ class ExportOptions:
     int8: bool = False
     """Weights as 8-bit integers, symmetric per output channel. The effect on decisions is measured."""
     nir_dialect: Literal["portable", "spikingjelly", "exact", "legacy"] = "portable"
-    """portable: most importers. spikingjelly: SpikingJelly with its default dt. exact: also reset by subtraction (uses
-    loops). legacy: nir 1.0.4 and older."""
+    """portable: most importers. spikingjelly: SpikingJelly with its default dt, and snnTorch. exact: also reset by
+    subtraction (uses loops). legacy: nir 1.0.5 and older."""
     parity_decisions: int = 1000
     """Recorded decisions per task on which the files are compared with the network."""
     checkpoint: Literal["last", "best"] = "last"

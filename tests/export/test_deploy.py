@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nir
 import numpy as np
 import pytest
 
@@ -66,20 +67,46 @@ def test_the_host_sees_what_the_agent_saw_in_training() -> None:
     game.close()
 
 
+def run_program(name: str, graph: nir.NIRGraph, observation: np.ndarray, folder: Path) -> subprocess.CompletedProcess:
+    write_nir(graph, folder / "task.nir")
+    np.save(folder / "observation.npy", observation)
+    (folder / "program.py").write_text(programs()[f"{name}_q.py"])
+    command = [sys.executable, "program.py", "task.nir", "observation.npy"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["norse", "spikingjelly", "sinabs"])
-def test_programs_for_other_simulators(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "neuron", "dialect"),
+    [
+        ("norse", "IF", "portable"),
+        ("norse", "LIF", "portable"),
+        ("spikingjelly", "IF", "portable"),
+        ("spikingjelly", "LIF", "spikingjelly"),
+        ("sinabs", "IF", "portable"),
+        ("snntorch", "LIF", "spikingjelly"),
+    ],
+)
+def test_programs_for_other_simulators(name: str, neuron: str, dialect: str, tmp_path: Path) -> None:
     simulator = SIMULATORS[name]
     if not simulator.installed:
         pytest.skip(f"{name} is not installed")
-    agent = dyadic_copy(make_agent(seed=2))
-    graph = nir_graph(fold_agent(agent), 1)
-    write_nir(graph, tmp_path / "asterix.nir")
+    agent = dyadic_copy(make_agent(seed=2, neuron=neuron))
+    graph = nir_graph(fold_agent(agent), 1, dialect)
     x = dyadic_observations(observations(agent, 1, seed=3))
-    np.save(tmp_path / "observation.npy", x[0])
-    (tmp_path / "program.py").write_text(programs()[f"{name}_q.py"])
-    command = [sys.executable, "program.py", "asterix.nir", "observation.npy"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run_program(name, graph, x[0], tmp_path)
     assert done.returncode == 0, done.stderr
     expected, _ = NirInterpreter(graph, **simulator.interpreter).run(encode(agent.suite, agent.config, x, 0))
     assert json.loads(done.stdout.splitlines()[-1]) == expected.mean(0)[0].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "neuron", "dialect"), [("sinabs", "LIF", "portable"), ("snntorch", "IF", "portable")])
+def test_programs_refuse_what_their_simulator_gets_wrong(name: str, neuron: str, dialect: str, tmp_path: Path) -> None:
+    if not SIMULATORS[name].installed:
+        pytest.skip(f"{name} is not installed")
+    agent = make_agent(trunk="mlp", neuron=neuron)
+    done = run_program(name, nir_graph(fold_agent(agent), 1, dialect), observations(agent, 1)[0], tmp_path)
+    assert done.returncode == 1
+    assert "expected" in done.stderr
+    assert "Traceback" not in done.stderr

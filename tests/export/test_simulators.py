@@ -1,58 +1,136 @@
-"""NIR files in other people's simulators, bitwise on exact numbers; each is skipped where it is not installed."""
+"""Files in other people's runtimes: every cell of the table in docs/deploy.md; skipped where one is not installed."""
 
 from __future__ import annotations
 
+import functools
+import importlib.util
+import re
+from collections.abc import Callable
 from pathlib import Path
 
+import nir
 import numpy as np
 import pytest
 
+from switchmt_snn.acting.agent import Agent
+from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
+from switchmt_snn.export.formats.onnx_writer import decision_model
+from switchmt_snn.export.parity.compare import trace_torch
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations
-from switchmt_snn.export.runtimes.agents import encode, read_nir
+from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
-from switchmt_snn.export.runtimes.simulators import SIMULATORS, simulate, skipped
+from switchmt_snn.export.runtimes.simulators import SIMULATORS, quietly, simulate, skipped
 from tests.export.export_cases import make_agent, observations
 
-CASES = [(name, "portable") for name in SIMULATORS] + [("spikingjelly", "spikingjelly")]
+DOCUMENT = Path(__file__).parents[2] / "docs" / "deploy.md"
+Run = Callable[[nir.NIRGraph, np.ndarray], np.ndarray]
+"""Outputs per step for encoded inputs ``[T, B, ...]``."""
+
+
+def spyx(graph: nir.NIRGraph, encoded: np.ndarray) -> np.ndarray:
+    import jax.numpy as jnp
+    from spyx.nir import from_nir
+
+    _, outputs = from_nir(graph, jnp.asarray(encoded), float(graph.metadata["dt"]))
+    return np.asarray(outputs)
+
+
+RUNTIMES: dict[str, tuple[str, Run]] = {
+    "NIR interpreter": ("nir", lambda graph, x: NirInterpreter(graph, reset=str(graph.metadata["reset"])).run(x)[0]),
+    "spyx 1.0": ("spyx", spyx),
+    **{
+        row: (name, functools.partial(simulate, name))
+        for row, name in {
+            "norse 1.1": "norse",
+            "nirtorch 2.6": "nirtorch",
+            "SpikingJelly 2.0": "spikingjelly",
+            "sinabs 3.1": "sinabs",
+            "snnTorch 1.0 importer": "snntorch",
+        }.items()
+    },
+}
+"""Module and function by the table's first column."""
+
+
+def table() -> list[tuple[str, str, str, str, str]]:
+    """Runtime, file, neuron, reset and result of each cell."""
+    (rows,) = re.findall(r"\| runtime \|.*?\n\|[-|]+\n((?:\|.*\n)+)", DOCUMENT.read_text())
+    cells = []
+    for row in rows.splitlines():
+        runtime, _, file, *results = (cell.strip() for cell in row.strip("|").split("|"))
+        kinds = [("IF", "zero"), ("IF", "subtract"), ("LIF", "zero"), ("LIF", "subtract")]
+        cells += [(runtime, file, *kind, result) for kind, result in zip(kinds, results, strict=True)]
+    return cells
+
+
+@functools.cache
+def network(neuron: str, reset: str, trunk: str) -> tuple[Agent, np.ndarray, np.ndarray]:
+    """An exact copy, observations of which some put a membrane on its threshold, and Q of task 1."""
+    agent = dyadic_copy(make_agent(seed=2, neuron=neuron, reset=reset, beta=0.75, trunk=trunk))
+    x = dyadic_observations(observations(agent, 12, seed=2))
+    return agent, x, trace_torch(agent, x, 1, 0).q_BA
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("name", "profile"), CASES)
-@pytest.mark.parametrize("method", ["SwitchMT", "DSQN"])
-def test_simulators_agree_bitwise(name: str, profile: str, method: str, tmp_path: Path) -> None:
-    simulator = SIMULATORS[name]
-    if not simulator.installed:
-        pytest.skip(f"{name} is not installed")
-    agent = dyadic_copy(make_agent(seed=2, method=method))
-    x = dyadic_observations(observations(agent, 12, seed=2))
-    for task in range(3):
-        write_nir(nir_graph(fold_agent(agent), task, profile), tmp_path / "task.nir")  # type: ignore[arg-type]
-        graph = read_nir(tmp_path / "task.nir")
-        encoded = encode(agent.suite, agent.config, x, 0)
-        expected, recorded = NirInterpreter(graph, **simulator.interpreter).run(encoded, ["hidden_neurons"])
-        assert recorded["hidden_neurons"].any()
-        assert np.array_equal(simulate(name, graph, encoded), expected), simulator.convention
+@pytest.mark.parametrize(("runtime", "file", "neuron", "reset", "result"), table())
+def test_every_cell_of_the_table_is_true(
+    runtime: str, file: str, neuron: str, reset: str, result: str, tmp_path: Path
+) -> None:
+    """On vectors (mlp) and, where they run, on images. Exact numbers have ties: > and >= differ."""
+    for trunk in ("mlp", "minatar") if result in ("exact", "at") else ("mlp",):
+        agent, x, q = network(neuron, reset, trunk)
+        if file.endswith(".onnx"):
+            assert result == "exact"
+            played = OnnxAgent(decision_model(fold_agent(agent)).SerializeToString(), agent.suite, agent.config)
+            assert np.array_equal(played.q_values(x, 1), q)
+            continue
+        if result == "not written":
+            with pytest.raises(ExportError, match="reset"):
+                nir_graph(fold_agent(agent), 1, file)
+            continue
+        module, run = RUNTIMES[runtime]
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed")
+        write_nir(nir_graph(fold_agent(agent), 1, file), tmp_path / "task.nir")
+        graph, encoded = read_nir(tmp_path / "task.nir"), np.ascontiguousarray(encode(agent.suite, agent.config, x, 0))
+        if module in SIMULATORS:
+            assert (skipped(module, graph) is None) == (result in ("exact", "at")), "export compares what runs"
+        if result == "refused":
+            with pytest.raises(Exception):  # noqa: B017, PT011 - whatever the importer raises
+                run(graph, encoded)
+            continue
+        with quietly():
+            seen = run(graph, encoded)
+        at, _ = NirInterpreter(graph, reset=str(graph.metadata["reset"]), fires_at_threshold=True).run(encoded)
+        found = "exact" if np.array_equal(seen.mean(0), q) else "at" if np.array_equal(seen, at) else "wrong"
+        # Where no membrane meets its threshold, both conventions agree.
+        assert found == result or (result == "at" and np.array_equal(at.mean(0), q)), found
+
+
+def test_the_table_has_every_runtime_and_every_cell_a_known_word() -> None:
+    words = {"exact", "at", "wrong", "refused", "not written"}
+    assert {result for *_, result in table()} == words
+    assert {runtime for runtime, *_ in table()} == {*RUNTIMES, "onnxruntime 1.31"}
 
 
 def test_a_simulator_that_is_not_compared_says_why() -> None:
     leaky = nir_graph(fold_agent(make_agent(neuron="LIF")), 0)
-    for name, simulator in SIMULATORS.items():
-        reason = skipped(name, leaky)
-        assert reason == "importers differ in what LIF means" if simulator.installed else reason.endswith("installed")
-    graph = nir_graph(fold_agent(make_agent()), 0, "exact")
-    assert all(skipped(name, graph) is not None for name in SIMULATORS)
+    reasons = {name: skipped(name, leaky) for name, simulator in SIMULATORS.items() if simulator.installed}
+    assert reasons.get("norse") is None
+    assert reasons["snntorch"] == "does not take the dialect portable, only spikingjelly"
+    assert reasons.get("sinabs", "refuses LIF").startswith("refuses LIF")
+    loops = nir_graph(fold_agent(make_agent(reset="subtract")), 0, "exact")
+    assert {name for name in SIMULATORS if skipped(name, loops) is None} <= {"nirtorch"}
 
 
 def test_conventions_differ_where_they_are_said_to() -> None:
     """On exact numbers there are ties: > and >=, and the two resets, must not agree by accident."""
-    agent = dyadic_copy(make_agent(seed=2))
-    graph = nir_graph(fold_agent(agent), 0)
-    encoded = encode(agent.suite, agent.config, dyadic_observations(observations(agent, 12, seed=2)), 0)
-    outputs = [NirInterpreter(graph, **simulator.interpreter).run(encoded)[0] for simulator in SIMULATORS.values()]
-    norse, nirtorch, spikingjelly, sinabs = outputs
-    assert np.array_equal(norse, nirtorch)
-    assert not np.array_equal(norse, spikingjelly)
-    assert not np.array_equal(spikingjelly, sinabs)
+    agent, x, _ = network("IF", "zero", "minatar")
+    graph, encoded = nir_graph(fold_agent(agent), 0), encode(agent.suite, agent.config, x, 0)
+    above, at = (NirInterpreter(graph, fires_at_threshold=at).run(encoded)[0] for at in (False, True))
+    subtracts, _ = NirInterpreter(graph, reset="subtract").run(encoded)
+    assert not np.array_equal(above, at)
+    assert not np.array_equal(above, subtracts)
