@@ -10,17 +10,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import nir
 import numpy.typing as npt
 import onnx
 
+from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError, ExportError, ParityError
 from switchmt_snn.export.folded import fold_agent, metadata
-from switchmt_snn.export.formats.nir_writer import DIALECT_KEY, NirDialect, nir_graph, write_nir
-from switchmt_snn.export.formats.obstacles import obstacles
+from switchmt_snn.export.formats.files import nir_graphs, onnx_models
+from switchmt_snn.export.formats.nir_writer import DIALECT_KEY, NirDialect, dialect_of, write_nir
 from switchmt_snn.export.formats.onnx_graph import OPSET
-from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
@@ -106,34 +107,27 @@ def export(
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
     network = fold_agent(agent)
     exported = quantized(network) if settings.int8 else network
-    settings, left_out = _formats_that_fit(settings, network)
-    for name, reason in left_out.items():
+    started = time.perf_counter()
+    built = _built(exported, settings, specialised)
+    for name, reason in built.left_out.items():
         note(f"left out {name.upper()}: {reason}")
     folder = _made(Path(out) if out is not None else run_folder.path / "export")
-    started = time.perf_counter()
     facts = provenance(run_folder.path) | {"weights": "int8" if settings.int8 else "float32"}
-    files: dict[str, Path] = {}
-    if settings.onnx:
-        files |= _write_onnx(exported, folder, specialised, facts)
-    if settings.nir:
-        files |= _write_nir(exported, folder, settings.nir_dialect, facts)
+    (folder / "parity.json").unlink(missing_ok=True)  # of the files that are replaced now
+    files = _write_onnx(built.models, folder, facts) | _write_nir(built.graphs, exported, folder, facts)
     for name, path in files.items():
         note(f"wrote {path} ({name})")
     written_at = time.perf_counter()
     note("parity: comparing the files with the trained network on recorded play")
-    recordings: list[Recording] = []
-
-    def arriving() -> Iterator[npt.NDArray[Any]]:
-        for recording in recorded_plays(agent, run_folder.path / "recordings", settings.parity_decisions):
-            recordings.append(recording)
-            yield recording.observations
-
-    parity = prove(agent, _read_back(exported, files), arriving())
-    parity["protocol"] = {
-        r.task: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed} for r in recordings
-    }
+    try:
+        parity = _compared(agent, run_folder, _read_back(exported, files), settings.parity_decisions)
+    except BaseException:
+        for path in files.values():  # nothing stays that was not compared
+            for written in (path, path.with_suffix(".json")):
+                written.unlink(missing_ok=True)
+        raise
     parity["wall_s"] = {"write": written_at - started, "record_and_compare": time.perf_counter() - written_at}
-    parity["left_out"] = left_out
+    parity["left_out"] = built.left_out
     write_atomically(folder / "parity.json", json.dumps(facts | parity, indent=1).encode())
     if parity["dyadic_skipped"] is not None:
         note(f"the exact check was left out: {parity['dyadic_skipped']}")
@@ -142,7 +136,7 @@ def export(
             f"parity failed: {'; '.join(parity['failures'])}; expected the trained network's decisions; see "
             f"{folder / 'parity.json'}"
         )
-    return ExportResult(folder, files, parity, left_out)
+    return ExportResult(folder, files, parity, built.left_out)
 
 
 def _made(folder: Path) -> Path:
@@ -155,43 +149,75 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _formats_that_fit(settings: ExportSettings, network: FoldedNetwork) -> tuple[ExportSettings, dict[str, str]]:
-    """The settings with every format that fits if none was asked for, and why others are left out.
+@dataclass(frozen=True)
+class _Built:
+    """What will be written: ONNX models by file name, NIR graphs by task, and why a format is left out."""
+
+    models: dict[str, onnx.ModelProto]
+    graphs: dict[str, nir.NIRGraph]
+    left_out: dict[str, str]
+
+
+def _built(network: FoldedNetwork, settings: ExportSettings, specialised: tuple[str, ...]) -> _Built:
+    """Every model and graph, before anything is on the disk; if no format was asked for, those of every one that fits.
 
     Raises:
-        ExportError: no format fits, or one task's ONNX file was asked for and ONNX does not.
+        ExportError: a format that was asked for does not fit (one task's ONNX file asks for ONNX), or none does.
     """
-    if settings.onnx or settings.nir:
-        return settings, {}
-    left_out = obstacles(network, settings.nir_dialect)
-    if "onnx" in left_out and (settings.tasks or "nir" in left_out):
-        raise ExportError(". ".join(left_out[name] for name in left_out if name == "onnx" or not settings.tasks))
-    return replace(settings, onnx="onnx" not in left_out, nir="nir" not in left_out), left_out
+    chosen = settings.onnx or settings.nir
+    models: dict[str, onnx.ModelProto] = {}
+    graphs: dict[str, nir.NIRGraph] = {}
+    left_out: dict[str, str] = {}
+    if settings.onnx or not chosen:
+        try:
+            models = onnx_models(network, specialised)
+        except ExportError as error:
+            if chosen or specialised:
+                raise
+            left_out["onnx"] = str(error)
+    if settings.nir or not chosen:
+        try:
+            graphs = nir_graphs(network, settings.nir_dialect)
+        except ExportError as error:
+            if chosen:
+                raise
+            left_out["nir"] = str(error)
+    if not models and not graphs:
+        raise ExportError(". ".join(left_out.values()))
+    return _Built(models, graphs, left_out)
 
 
-def _write_onnx(
-    network: FoldedNetwork, folder: Path, specialised: tuple[str, ...], facts: dict[str, Any]
-) -> dict[str, Path]:
-    models: dict[str, onnx.ModelProto] = {"decision": decision_model(network)}
-    if network.spiking:
-        models["step"] = step_model(network)
-    for task in specialised:
-        models[f"decision_{file_name(task)}"] = decision_model(network, network.task_index(task))
+def _compared(agent: Agent, run: RunFolder, written: Exports, decisions: int) -> dict[str, Any]:
+    """What ``prove`` says about files on recorded play, and how that was played."""
+    recordings: list[Recording] = []
+
+    def arriving() -> Iterator[npt.NDArray[Any]]:
+        for recording in recorded_plays(agent, run.path / "recordings", decisions):
+            recordings.append(recording)
+            yield recording.observations
+
+    parity = prove(agent, written, arriving())
+    protocol = {r.task: {"decisions": len(r.actions), "epsilon": r.epsilon, "seed": r.seed} for r in recordings}
+    return parity | {"protocol": protocol}
+
+
+def _write_onnx(models: dict[str, onnx.ModelProto], folder: Path, facts: dict[str, Any]) -> dict[str, Path]:
     files = {}
     for name, model in models.items():
         for key, value in (facts | {"opset": str(OPSET)}).items():
             entry = model.metadata_props.add()
             entry.key, entry.value = key, value
-        files[f"{name}.onnx"] = folder / f"{name}.onnx"
-        write_atomically(files[f"{name}.onnx"], model.SerializeToString())
-        (folder / f"{name}.onnx.data").unlink(missing_ok=True)  # weights of an export by another tool
+        files[name] = folder / name
+        write_atomically(files[name], model.SerializeToString())
+        (folder / f"{name}.data").unlink(missing_ok=True)  # weights of an export by another tool
     return files
 
 
-def _write_nir(network: FoldedNetwork, folder: Path, dialect: NirDialect, facts: dict[str, Any]) -> dict[str, Path]:
+def _write_nir(
+    graphs: dict[str, nir.NIRGraph], network: FoldedNetwork, folder: Path, facts: dict[str, Any]
+) -> dict[str, Path]:
     files = {}
-    for index, task in enumerate(network.tasks):
-        graph = nir_graph(network, index, dialect)
+    for task, graph in graphs.items():
         graph.metadata.update(facts)
         path = folder / f"{file_name(task)}.nir"
         temporary = path.with_suffix(".tmp.nir")
@@ -200,7 +226,7 @@ def _write_nir(network: FoldedNetwork, folder: Path, dialect: NirDialect, facts:
             temporary.rename(path)
         finally:
             temporary.unlink(missing_ok=True)
-        beside = metadata(network) | facts | {"task": task, DIALECT_KEY: dialect, "dt": graph.metadata["dt"]}
+        beside = metadata(network) | facts | {"task": task, DIALECT_KEY: dialect_of(graph), "dt": graph.metadata["dt"]}
         write_atomically(path.with_suffix(".json"), json.dumps(beside, indent=1).encode())
         files[path.name] = path
     return files

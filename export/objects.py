@@ -15,8 +15,8 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.export.formats.files import obstacles
 from switchmt_snn.export.formats.nir_writer import NirDialect, nir_graph
-from switchmt_snn.export.formats.obstacles import obstacles
 from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove

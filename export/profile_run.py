@@ -25,7 +25,7 @@ from switchmt_snn.export.counts.nir_file import count_nir
 from switchmt_snn.export.energy.estimate import Energy, Target, estimate
 from switchmt_snn.export.energy.traffic import ann_traffic, traffic
 from switchmt_snn.export.folded import fold_agent
-from switchmt_snn.export.formats.obstacles import obstacles
+from switchmt_snn.export.formats.files import obstacles
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report.page import Frames, render_report

@@ -195,15 +195,17 @@ def export_neurons(neurons: NeuronNode, chain: Chain, layer: Layer, dialect: str
 
 @export_neurons.register
 def _(neurons: LeakyNode, chain: Chain, layer: Layer, dialect: str) -> None:
+    _refuse_reset_owed_at_rest(neurons)
     if neurons.reset == "subtract" and dialect == "legacy" and _decays(neurons.beta_O):
         raise ExportError(
             "LIF neurons reset by subtraction, expected IF for the NIR dialect 'legacy': its importers subtract at the "
             "spike, before the membrane decays; use --nir-dialect exact"
         )
     if neurons.reset == "subtract" and dialect in ("portable", "spikingjelly"):
+        others = "" if _decays(neurons.beta_O) else " or legacy (sinabs)"
         raise ExportError(
             f"the network resets by subtraction, expected reset to zero for the NIR dialect {dialect!r} (that is what "
-            "importers of nir.IF do); use --nir-dialect exact (any simulator with loops) or legacy (sinabs)"
+            f"importers of nir.{neurons.kind} do); use --nir-dialect exact (any simulator with loops){others}"
         )
     if _needs_loop(neurons, dialect):
         _append_loop(neurons, chain, layer, _DT[dialect])
@@ -219,6 +221,7 @@ def _(neurons: SynapticNode, chain: Chain, layer: Layer, dialect: str) -> None:
             "exact: nir.CubaLIF resets at the spike, snnTorch's Synaptic after the next input; use --onnx, or "
             "network.reset subtract and --nir-dialect exact"
         )
+    _refuse_reset_owed_at_rest(neurons)
     chain.append(f"{layer.name}_current", _integrator(layer, neurons.alpha_O, _DT[dialect]))
     _append_loop(neurons, chain, layer, _DT[dialect])
 
@@ -226,6 +229,15 @@ def _(neurons: SynapticNode, chain: Chain, layer: Layer, dialect: str) -> None:
 @export_neurons.register
 def _(neurons: AdaptiveNode, chain: Chain, layer: Layer, dialect: str) -> None:
     raise ExportError("NIR cannot express ALIF: no node has a threshold that changes; use --onnx")
+
+
+def _refuse_reset_owed_at_rest(neurons: LeakyNode | SynapticNode) -> None:
+    """A membrane at rest that is above its threshold is reset at the first step. NIR knows no such spike before it."""
+    if neurons.reset == "subtract" and (neurons.threshold_O < 0).any():
+        raise ExportError(
+            f"a learned threshold is {neurons.threshold_O.min():.4g}, expected at least 0 for NIR with reset by "
+            "subtraction: it is subtracted at the first step, before any spike; use --onnx"
+        )
 
 
 def _decays(decay_O: Array) -> bool:

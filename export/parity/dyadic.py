@@ -167,7 +167,9 @@ def _to_grid(value: Tensor, bits: int) -> Tensor:
 
 
 def _dyadic_decay(value: Tensor | float) -> float:
-    return min(_DYADIC_BETAS, key=lambda decay: abs(decay - float(value)))
+    """Of a decay as the neurons use it, within [0, 1]; no decay stays none, so that a copy has the same nodes."""
+    decay = min(max(float(value), 0.0), 1.0)
+    return decay if decay == 1.0 else min(_DYADIC_BETAS, key=lambda near: abs(near - decay))
 
 
 @singledispatch
@@ -202,8 +204,7 @@ def _(layer: ReLULayer) -> None:
 @round_neurons.register
 def _(layer: LeakyLayer) -> None:
     _round_threshold(layer)
-    if float(layer.leaky.beta) != 1.0:
-        layer.leaky.beta.fill_(_dyadic_decay(layer.leaky.beta))
+    layer.leaky.beta.fill_(_dyadic_decay(layer.leaky.beta))
 
 
 @round_neurons.register

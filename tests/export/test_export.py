@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from switchmt_snn.config import METHOD_TRAITS, METHODS
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.export.formats.files import obstacles
 from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
-from switchmt_snn.export.formats.obstacles import obstacles
 from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports, compare, trace_torch
 from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations, exact_copy

@@ -113,12 +113,12 @@ def test_a_failed_parity_exits_1_and_names_the_layer(
     trained_run: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A writer with a wrong threshold in one layer."""
-    from switchmt_snn.export import export_run as command
+    from switchmt_snn.export.formats import files
     from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
     from switchmt_snn.export.parity import proof
     from tests.export.test_export import with_wrong_layer
 
-    for module in (command, proof):
+    for module in (files, proof):
         monkeypatch.setattr(module, "decision_model", lambda n, task=None: decision_model(with_wrong_layer(n, 1), task))
         monkeypatch.setattr(module, "step_model", lambda n: step_model(with_wrong_layer(n, 1)))
     _, err = run_command("export", trained_run, "--onnx", "--parity-decisions", 20, code=1)
