@@ -57,7 +57,7 @@ def record(suite: TaskSuite, task: int, agent: Agent | None, steps: int) -> tupl
         actions = valid[rng.integers(0, len(valid), ENVS)]
         if agent is not None:
             greedy = rng.random(ENVS) >= EPSILON
-            actions = np.where(greedy, agent.act(play.observations, task), actions)
+            actions = np.where(greedy, agent.q_values(play.observations, task).argmax(axis=-1), actions)
         started = time.perf_counter()
         result = play.step(actions)
         spent += time.perf_counter() - started

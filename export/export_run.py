@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -27,7 +26,7 @@ from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, read_nir
-from switchmt_snn.runs.files import file_name, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
@@ -128,7 +127,7 @@ def export(
         raise
     parity["wall_s"] = {"write": written_at - started, "record_and_compare": time.perf_counter() - written_at}
     parity["left_out"] = built.left_out
-    write_atomically(folder / "parity.json", json.dumps(facts | parity, indent=1).encode())
+    write_atomically(folder / "parity.json", json_text(facts | parity, indent=1).encode())
     if parity["dyadic_skipped"] is not None:
         note(f"the exact check was left out: {parity['dyadic_skipped']}")
     if parity["failures"]:
@@ -227,7 +226,7 @@ def _write_nir(
         finally:
             temporary.unlink(missing_ok=True)
         beside = metadata(network) | facts | {"task": task, DIALECT_KEY: dialect_of(graph), "dt": graph.metadata["dt"]}
-        write_atomically(path.with_suffix(".json"), json.dumps(beside, indent=1).encode())
+        write_atomically(path.with_suffix(".json"), json_text(beside, indent=1).encode())
         files[path.name] = path
     return files
 
@@ -275,7 +274,7 @@ def evaluate_exported(
     decisions, equal = (sum(column) for column in zip(*compared.compared, strict=True))
     share = equal / decisions
     facts = {"runtime": runtime, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
-    write_atomically(folder.path / "export" / f"evaluation_{runtime}.json", json.dumps(facts, indent=1).encode())
+    write_atomically(folder.path / "export" / f"evaluation_{runtime}.json", json_text(facts, indent=1).encode())
     return evaluation, share
 
 

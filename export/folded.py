@@ -18,7 +18,13 @@ def fold_agent(agent: Agent) -> FoldedNetwork:
     """
     suite = agent.suite
     return fold(
-        agent.network, suite.names, suite.action_names, suite.valid_actions_KA, suite.frame_dtype, step=agent.step
+        agent.network,
+        suite.names,
+        suite.action_names,
+        suite.valid_actions_KA,
+        suite.frame_dtype,
+        step=agent.step,
+        first_actions=suite.first_actions,
     )
 
 
@@ -43,6 +49,8 @@ def metadata(network: FoldedNetwork) -> dict[str, Any]:
         "valid_actions": {
             name: np.flatnonzero(network.valid_actions_KA[k]).tolist() for k, name in enumerate(network.tasks)
         },
+        # What an environment adds to the index of the largest Q-value.
+        "first_actions": dict(zip(network.tasks, network.first_actions or (0,) * len(network.tasks), strict=True)),
         "observation_shape": list(seen.shape),
         "frame_stack": seen.frame_stack,
         "scale": seen.scale,

@@ -32,7 +32,7 @@ from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.runs.environment import command_line
-from switchmt_snn.runs.files import write_atomically
+from switchmt_snn.runs.files import json_text, write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.tasks.registry import suite_of
@@ -168,7 +168,7 @@ def compare_profiles(profiles: Iterable[ProfileResult], out: str | Path | None =
     folder = _folder(Path(out)) if out is not None else compared[0].folder
     command, runs = command_line(), [profile.facts for profile in compared]
     facts = {"schema": SCHEMA, "command": command, "runs": runs}
-    write_atomically(folder / "comparison.json", json.dumps(facts, indent=1).encode())
+    write_atomically(folder / "comparison.json", json_text(facts, indent=1).encode())
     page = folder / "comparison.html"
     write_atomically(page, render_report(runs, [profile.frames for profile in compared], command).encode())
     return page
@@ -207,7 +207,7 @@ def _written(
         "targets": {target.name: asdict(target) for target in targets},
         "tasks": tasks,
     }
-    write_atomically(folder / "profile.json", json.dumps(facts, indent=1).encode())
+    write_atomically(folder / "profile.json", json_text(facts, indent=1).encode())
     write_atomically(folder / "layers.csv", _layers_csv(profiles).encode())
     write_atomically(folder / "report.html", render_report([facts], [frames], facts["command"]).encode())
     return ProfileResult(folder, facts, frames)

@@ -31,9 +31,11 @@ class Recording:
 
     Attributes:
         observations: raw stacked observations ``[N, *shape]``.
-        actions: what was done ``[N]``.
+        actions: what was done ``[N]``, as indices of Q-values.
         epsilon: share of random actions while it was recorded.
         seed: of the episodes.
+
+    The file also has ``first_action``, which the environment adds to every action (0 for most).
     """
 
     task: str
@@ -72,6 +74,7 @@ def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Reco
         temporary,
         observations=recording.observations,
         actions=recording.actions,
+        first_action=np.asarray(agent.suite.first_action(agent.suite.index(task))),
         epsilon=np.asarray(recording.epsilon),
         seed=np.asarray(recording.seed),
     )
@@ -136,7 +139,9 @@ def play_in_pieces(
                 explore = rng.random(COPIES) < epsilon
                 random_actions = valid[rng.integers(0, len(valid), COPIES)]
                 observations[:, step] = copies.observations
-                actions[:, step] = np.where(explore, random_actions, agent.act(copies.observations, index))
+                actions[:, step] = np.where(
+                    explore, random_actions, agent.q_values(copies.observations, index).argmax(axis=-1)
+                )
                 copies.step(actions[:, step])
             yield observations, actions
             left -= steps

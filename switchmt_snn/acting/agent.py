@@ -72,7 +72,10 @@ class Agent:
         return values[0] if observation.shape == expected else values
 
     def act(self, observation: npt.NDArray[Any], task: str | int) -> Any:
-        """The greedy action (an int) for one observation, or actions ``[B]`` for a batch; see ``q_values``.
+        """The greedy action (an int) for one observation, or ``[B]`` for a batch, as the environment takes it.
+
+        That is the index of the largest Q-value (see ``q_values``), plus the ``start`` of the environment's
+        ``Discrete`` space (``suite.first_actions``).
 
         Example:
             >>> import numpy as np
@@ -82,5 +85,5 @@ class Agent:
             >>> agent.act(observation, task="CartPole-v1") in (0, 1)
             True
         """
-        action = self.q_values(observation, task).argmax(axis=-1)
+        action = self.q_values(observation, task).argmax(axis=-1) + self.suite.first_action(self.suite.index(task))
         return int(action) if np.ndim(action) == 0 else action

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,6 +10,7 @@ from rich.console import Console
 
 from switchmt_snn.cli.parsing import leading_name, parse
 from switchmt_snn.config import ExperimentConfig, load_config, resolve
+from switchmt_snn.runs.files import json_text
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def command(argv: list[str]) -> int:
     methods = describe(config)
     if options.json:
         facts: dict[str, Any] = {"config": config.name, "available_memory_bytes": available_bytes()}
-        print(json.dumps({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}}))
+        print(json_text({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}}))
         return 0
     console = Console()
     console.print(methods_table(methods))

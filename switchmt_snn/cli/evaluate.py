@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +9,7 @@ from typing import Any, Literal
 from rich.console import Console
 
 from switchmt_snn.cli.parsing import leading_name, parse
+from switchmt_snn.runs.files import json_text
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def command(argv: list[str]) -> int:
         evaluation, share = evaluate_exported(options.runtime, path, options.task, options.checkpoint, **protocol)
         facts = {"runtime": options.runtime, "equal_actions_share": share}
     if options.json:
-        print(json.dumps({"run": str(path), **facts, **evaluation.to_dict()}))
+        print(json_text({"run": str(path), **facts, **evaluation.to_dict()}))
         return 0
     Console().print(evaluation_table(evaluation))
     if facts:

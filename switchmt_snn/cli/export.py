@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from switchmt_snn.cli.parsing import leading_name, parse
+from switchmt_snn.runs.files import json_text
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def command(argv: list[str]) -> int:
     )
     if options.json:
         files = {name: str(path) for name, path in result.files.items()}
-        print(json.dumps({"folder": str(result.folder), "files": files, "parity": result.parity}))
+        print(json_text({"folder": str(result.folder), "files": files, "parity": result.parity}))
         return 0
     console.print(parity_table(result.parity))
     print(result.folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -12,6 +11,7 @@ from rich.console import Console
 
 from switchmt_snn.cli.parsing import leading_names, parse
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.runs.files import json_text
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def command(argv: list[str]) -> int:
     if len(profiles) > 1:
         report = compare_profiles(profiles, options.out)
     if options.json:
-        print(json.dumps(profiles[0].facts) if len(profiles) == 1 else report.with_suffix(".json").read_text())
+        print(json_text(profiles[0].facts) if len(profiles) == 1 else report.with_suffix(".json").read_text())
         return 0
     _print_profiles([one.facts for one in profiles])
     print(report)

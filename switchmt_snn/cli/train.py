@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +11,7 @@ from rich.console import Console
 
 from switchmt_snn.cli.parsing import leading_name, parse, peek
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
+from switchmt_snn.runs.files import json_text
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def command(argv: list[str]) -> int:
         return 0
     if options.json:
         scores = None if result.evaluation is None else result.evaluation.to_dict()
-        print(json.dumps({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores}))
+        print(json_text({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores}))
     again = f"switchmt-snn train --run {result.path}"
     if result.status == "stopped":
         console.print(f"stopped at step {result.step:,}; continue exactly here with: {again}", soft_wrap=True)

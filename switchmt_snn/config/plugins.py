@@ -74,7 +74,7 @@ def import_plugin_module(module_name: str) -> ModuleType:
     except ImportError:
         raise
     except Exception as error:  # whatever the module's own code raises
-        raise ImportError(" ".join(f"{type(error).__name__}: {error}".split())) from error
+        raise ImportError(failure(error)) from error
 
 
 def plugin_file(name: str) -> Path | None:

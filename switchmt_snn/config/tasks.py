@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from switchmt_snn.config.checks import check_fields, require
+from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.config.suites import require_suite_name, suite_defaults
+from switchmt_snn.errors import did_you_mean
+
+BUILT_IN_WRAPPERS = ("FlattenObservation", "FlattenAction")
+"""Wrappers of ``tasks.wrappers`` that are named without a module."""
 
 
 @dataclass(frozen=True)
@@ -16,6 +22,13 @@ class TasksConfig:
     """Where names are looked up: atari, minatar, gym (Gymnasium ids), or package.module:Name, a Suite of your own."""
     names: tuple[str, ...] = ("pong", "breakout", "enduro")
     """Tasks in the order in which training visits them. In the gym suite, module:MyEnv-v0 imports module first."""
+    wrappers: tuple[str, ...] = ()
+    """gym suite: wrappers of every environment, the innermost first. FlattenObservation: Dict, Tuple and Discrete
+    observations become vectors. FlattenAction: one action for every combination of a MultiDiscrete space. module:Name:
+    a gymnasium.Wrapper of your own, called with the environment."""
+    image_layout: Literal["by_shape", "channels_last", "channels_first"] = "by_shape"
+    """gym suite: which axis of images with three axes holds the channels. by_shape: the shape tells; one that does not
+    say is refused."""
     num_envs: int = 1
     """Copies of the current task that are stepped together; one vector step counts as this many agent steps."""
     frame_stack: int | None = None
@@ -41,6 +54,14 @@ class TasksConfig:
         require_suite_name(self.suite)
         require(len(self.names) > 0, "tasks.names", self.names, "at least one task")
         require(len(set(self.names)) == len(self.names), "tasks.names", self.names, "every task once")
+        for name in self.wrappers:
+            require(
+                name in BUILT_IN_WRAPPERS or is_plugin(name),
+                "tasks.wrappers",
+                name,
+                f"{', '.join(BUILT_IN_WRAPPERS)}, or module:Name",
+                f"use a wrapper of your own for others{did_you_mean(name, BUILT_IN_WRAPPERS)}",
+            )
         require(self.num_envs >= 1, "tasks.num_envs", self.num_envs, "at least 1")
         require(self.frame_stack is None or self.frame_stack >= 1, "tasks.frame_stack", self.frame_stack, ">= 1")
         require(self.frame_skip >= 1, "tasks.frame_skip", self.frame_skip, "at least 1")

@@ -15,8 +15,12 @@ from switchmt_snn.config.experiment import ExperimentConfig
 from switchmt_snn.errors import ConfigError, did_you_mean
 
 
-def load_config(source: str | Path) -> ExperimentConfig:
+def load_config(source: str | Path, absent: dict[str, dict[str, Any]] | None = None) -> ExperimentConfig:
     """Read a config from a YAML file, or a preset by name (``quickstart``, ``paper``, ``configs/paper.yaml``).
+
+    Args:
+        source: file or preset.
+        absent: what settings by section are, if the file does not name them; None means the defaults.
 
     Raises:
         ConfigError: no such file or preset, not YAML, or a key or value that the config does not take.
@@ -36,6 +40,9 @@ def load_config(source: str | Path) -> ExperimentConfig:
         ) from error
     if data is None:
         data = {}
+    for section, values in (absent or {}).items():
+        if isinstance(data, dict) and isinstance(data.get(section, {}), dict):
+            data[section] = values | data.get(section, {})
     return from_dict(data, where=str(source))
 
 

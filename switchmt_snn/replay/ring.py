@@ -133,7 +133,7 @@ class FrameReplay:
         else:
             self._frames = PlainFrames(*form) if device is None else DeviceFrames(*form, device)
         flat = self.slots * num_lanes
-        self._actions = np.full(flat, -1, np.int16)
+        self._actions = np.full(flat, -1, np.int32)
         self._rewards = np.zeros(flat, np.float32)
         self._terminated = np.zeros(flat, np.bool_)
         self._age = np.zeros(flat, np.uint8)  # steps since the episode's start, at most stack - 1

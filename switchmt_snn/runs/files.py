@@ -1,11 +1,14 @@
-"""Files that are whole or absent (written under a temporary name, synced, then renamed), and their names."""
+"""Files that are whole or absent (written under a temporary name, synced, then renamed), their names, and JSON."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import math
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _LONGEST_LIST = 120
@@ -34,6 +37,23 @@ def _one_name(task: str) -> str:
 
 def _marked(text: str, hashed: str) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_.-]', '_', text)[:40].lstrip('.-')}~{sha256(hashed.encode())[:16]}"
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """Plain values as JSON (RFC 8259). It has no NaN and no infinity: a number that is not finite becomes null.
+
+    >>> json_text({"q": [1.5, float("nan")]})
+    '{"q": [1.5, null]}'
+    """
+    return json.dumps(_finite(value), indent=indent, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_atomically(path: Path, content: bytes) -> None:

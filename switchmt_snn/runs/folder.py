@@ -19,7 +19,7 @@ from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import EvaluationConfig, ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.checkpoint import CheckpointStore
-from switchmt_snn.runs.files import file_name, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, write_atomically
 
 RUNS = Path("runs")
 
@@ -43,6 +43,11 @@ def latest_run() -> Path:
     if not runs:
         raise RunFolderError(f"no run in {RUNS.resolve()}, expected one; run switchmt-snn train, or name a run folder")
     return max(runs, key=lambda run: ((run / "environment.json").stat().st_mtime, run.name))
+
+
+BEFORE = {"tasks": {"image_layout": "channels_last"}}
+"""What a run did without being asked before a setting existed, where today's default is another. A run stores every
+setting, so one that is missing did not exist."""
 
 
 class RunFolder:
@@ -80,7 +85,7 @@ class RunFolder:
         path = self.path / "config.yaml"
         if not path.is_file():
             raise RunFolderError(f"{path} is missing, expected the run's config; the run folder is damaged")
-        return load_config(path)
+        return load_config(path, absent=BEFORE)
 
     def checkpoints(self, keep: int = 2) -> CheckpointStore:
         """The run's checkpoints."""
@@ -104,7 +109,7 @@ class RunFolder:
             (self.path / "evaluations").mkdir()
             write_atomically(self.path / "config.yaml", to_yaml(config).encode())
             # Last: a folder is a run once this file says so.
-            write_atomically(self.path / "environment.json", json.dumps(environment, indent=1).encode())
+            write_atomically(self.path / "environment.json", json_text(environment, indent=1).encode())
         except OSError as error:
             raise RunFolderError(_unwritable(self.path, error)) from error
 
@@ -125,7 +130,7 @@ class RunFolder:
             new = {name: digest for name, digest in files_sha256.items() if known.get(name) != digest}
             if new:
                 rows.append({"step": step, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "files_sha256": new})
-                write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+                write_atomically(path, "".join(json_text(row) + "\n" for row in rows).encode())
         except (ValueError, TypeError, KeyError) as error:
             raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected JSON lines; delete it") from error
         return [name for name in new if name in known]
@@ -167,7 +172,7 @@ class RunFolder:
         try:
             folder.mkdir(exist_ok=True)
             write_atomically(folder / f"{stem}.csv", text.getvalue().encode())
-            write_atomically(folder / f"{stem}.json", json.dumps(evaluation.to_dict(), indent=1).encode())
+            write_atomically(folder / f"{stem}.json", json_text(evaluation.to_dict(), indent=1).encode())
         except OSError as error:
             raise RunFolderError(_unwritable(folder, error)) from error
         return folder / f"{stem}.csv"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import time
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from typing import IO, Any
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDecided
 from switchmt_snn.learning.switching import DECISION_COLUMNS, SwitchTo
+from switchmt_snn.runs.files import json_text
 
 EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncated", "epsilon", "updates", "wall_s")
 
@@ -57,7 +57,7 @@ class RunLogs:
         elif isinstance(event, SwitchDecided):
             self._tables["switches.csv"].writerow(self._switch_row(event))
         elif isinstance(event, Measured):
-            self._files["metrics.jsonl"].write(json.dumps(self._metrics_row(event) | {"wall_s": wall_s}) + "\n")
+            self._files["metrics.jsonl"].write(json_text(self._metrics_row(event) | {"wall_s": wall_s}) + "\n")
 
     def _episode_row(self, event: EpisodeEnded) -> dict[str, Any]:
         return {

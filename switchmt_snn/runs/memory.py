@@ -62,7 +62,7 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
     steps = config.network.timesteps
     activations = batch * 4 * (8 * neurons * steps + 4 * math.prod(suite.observation_shape))
     return MemoryEstimate(
-        replay_bytes=frames + slots * (2 + 4 + 1 + 1 + 1),  # action, reward, three flags
+        replay_bytes=frames + slots * (4 + 4 + 1 + 1 + 1),  # action, reward, three flags
         network_bytes=5 * parameters,  # weights, gradients, two Adam moments, target network
         switching_bytes=snapshots * parameters,
         activations_bytes=activations,

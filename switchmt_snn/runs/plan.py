@@ -72,6 +72,8 @@ def plan(
         TaskError: a task does not exist or cannot be learned by a Q-network.
     """
     config = resolve(config)
+    if stored is not None and config.tasks.image_layout == "by_shape":
+        config = replace(config, tasks=replace(config.tasks, image_layout=stored.tasks.image_layout))
     if device is None:
         device = select_device(config.device)
     if is_plugin(config.switching.policy):

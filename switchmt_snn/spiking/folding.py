@@ -77,6 +77,7 @@ class FoldedNetwork:
         actions: names.
         valid_actions_KA: which actions exist in which task.
         step: training step of the weights.
+        first_actions: by task, what its environment adds to an action's index; empty means 0.
     """
 
     layers: tuple[Layer, ...]
@@ -89,6 +90,7 @@ class FoldedNetwork:
     actions: tuple[str, ...]
     valid_actions_KA: npt.NDArray[np.bool_]
     step: int
+    first_actions: tuple[int, ...] = ()
 
     @property
     def synapses(self) -> tuple[SynapseNode, ...]:
@@ -142,6 +144,7 @@ def fold(
     valid_actions_KA: npt.NDArray[np.bool_] | None = None,
     observation_dtype: npt.DTypeLike | None = None,
     step: int = 0,
+    first_actions: Sequence[int] = (),
 ) -> FoldedNetwork:
     """Fold a network for all its tasks.
 
@@ -152,6 +155,7 @@ def fold(
         valid_actions_KA: which actions exist in which task; None means all.
         observation_dtype: of raw observations; None means uint8 for a range of [0, 1], else float32.
         step: training step of the weights.
+        first_actions: by task, what its environment adds to an action's index; empty means 0.
 
     Raises:
         ExportError: a weight is not finite, or a module has no node.
@@ -177,6 +181,7 @@ def fold(
         if valid_actions_KA is None
         else valid_actions_KA,
         step=step,
+        first_actions=tuple(first_actions),
     )
 
 

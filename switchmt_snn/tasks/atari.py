@@ -145,6 +145,7 @@ class AtariSuite(Suite):
             valid_actions_KA=_valid_actions(config, action_names),
             references={name: self.references[name] for name in config.names if name in self.references},
             make=make,
+            thread_safe=True,
         )
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from switchmt_snn.config import TasksConfig, resolved_frame_stack
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import MissingExtraError
-from switchmt_snn.tasks.gym import Env, GymCopies, channels_first
+from switchmt_snn.tasks.gym_copies import Env, GymCopies
+from switchmt_snn.tasks.gym_spaces import channels_last
 from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
 
 GAMES = ("asterix", "breakout", "freeway", "seaquest", "space_invaders")
@@ -60,7 +61,9 @@ class MinAtarSuite(Suite):
 
         def make(task: int, num_envs: int) -> TaskEnvironment:
             envs = [_make_env(config.names[task], config) for _ in range(num_envs)]
-            return GymCopies(envs, frame_shape, np.uint8, channels_first, before_reset=_forget_previous_action)
+            return GymCopies(
+                config.names[task], envs, frame_shape, np.uint8, channels_last, before_reset=_forget_previous_action
+            )
 
         return TaskSuite(
             names=config.names,
@@ -73,6 +76,7 @@ class MinAtarSuite(Suite):
             valid_actions_KA=valid_actions_KA,
             references={},
             make=make,
+            thread_safe=True,
         )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from switchmt_snn.tasks.contract import CheckedEnvironment
 from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
 
 
@@ -35,7 +36,7 @@ class Play:
     def __init__(self, suite: TaskSuite, task: int, num_envs: int) -> None:
         self.task = task
         self.num_envs = num_envs
-        self._environment = suite.make(task, num_envs)
+        self._environment = CheckedEnvironment(suite, task, num_envs)
         self._channels = suite.frame_shape[0]
         self.observations: Frames = np.zeros((num_envs, *suite.observation_shape), suite.frame_dtype)
         self.returns = np.zeros(num_envs)
@@ -79,7 +80,7 @@ class Play:
         return {
             "task": self.task,
             "seeds": self._seeds.copy(),
-            "actions": [np.asarray(actions, np.int16) for actions in self._actions],
+            "actions": [np.asarray(actions, np.int32) for actions in self._actions],
             "fingerprint": self._fingerprint(),
         }
 

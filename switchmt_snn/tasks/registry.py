@@ -64,7 +64,7 @@ def make_suite(config: TasksConfig) -> TaskSuite:
     """Make the tasks that a config names.
 
     Raises:
-        ConfigError: unknown suite, or one that does not follow ``tasks.minimal_action_mask``.
+        ConfigError: unknown suite, or one that does not follow ``tasks.minimal_action_mask`` or ``tasks.wrappers``.
         TaskError: a task is unknown, does not fit a Q-network, or is not what its suite says.
         MissingExtraError: the suite needs an optional package.
     """
@@ -78,6 +78,12 @@ def make_suite(config: TasksConfig) -> TaskSuite:
             f"tasks.minimal_action_mask is True, expected false for the suite {config.suite!r}, which states no "
             "minimal actions (masks_actions)"
         )
+    for key, asked in (("wrappers", bool(config.wrappers)), ("image_layout", config.image_layout == "channels_first")):
+        if asked and not suite.takes_wrappers:
+            raise ConfigError(
+                f"tasks.{key} is {getattr(config, key)!r}, expected the default for the suite {config.suite!r}, whose "
+                "environments are no Gymnasium environments (takes_wrappers)"
+            )
     tasks = suite.make()
     stack, shape = resolved_frame_stack(config), tasks.valid_actions_KA.shape
     readable = all(name and name.isprintable() and not set(name) & set(',"') for name in tasks.names)
@@ -91,6 +97,11 @@ def make_suite(config: TasksConfig) -> TaskSuite:
             shape == (len(tasks.names), tasks.num_actions) and bool(tasks.valid_actions_KA.any(axis=1).all()),
             f"valid_actions_KA {tasks.valid_actions_KA.tolist()}",
             "a row per task and a column per action, at least one action true in each row",
+        ),
+        (
+            len(tasks.first_actions) in (0, len(tasks.names)),
+            f"first_actions {tasks.first_actions}",
+            f"none, or one for each of {len(tasks.names)} tasks",
         ),
     )
     for holds, seen, expected in checks:

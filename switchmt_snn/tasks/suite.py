@@ -89,6 +89,10 @@ class TaskSuite:
         action_names: one per action of the shared action space.
         valid_actions_KA: which actions exist in which task.
         references: published scores, where there are any.
+        first_actions: by task, the number by which its environment calls action 0 (``start`` of a ``Discrete`` space);
+            empty means 0 in every task. ``make``'s environments take actions from 0; ``Agent.act`` and exports name the
+            environment's.
+        thread_safe: whether copies may be stepped in several threads at a time; evaluations then use every core.
     """
 
     names: tuple[str, ...]
@@ -102,6 +106,12 @@ class TaskSuite:
     references: dict[str, Reference]
     make: Callable[[int, int], TaskEnvironment]
     """``make(task, num_envs)`` builds the environments of a task."""
+    first_actions: tuple[int, ...] = ()
+    thread_safe: bool = False
+
+    def first_action(self, task: int) -> int:
+        """The number by which a task's environment calls action 0."""
+        return self.first_actions[task] if self.first_actions else 0
 
     @property
     def num_actions(self) -> int:
@@ -158,6 +168,7 @@ class Suite:
         frames_per_s: emulator frames per second of real time; None if the tasks have no clock.
         steps_to_learn: training for fewer agent steps teaches nothing, and a short run says so; None says nothing.
         masks_actions: whether ``make`` follows ``tasks.minimal_action_mask``; else that setting is refused.
+        takes_wrappers: whether ``make`` follows ``tasks.wrappers`` and ``tasks.image_layout``; else they are refused.
         references: random and human scores by task, for normalised scores.
         published: rows that are printed under an evaluation.
         config: the tasks that a config asks for.
@@ -171,6 +182,7 @@ class Suite:
     frames_per_s: ClassVar[float | None] = None
     steps_to_learn: ClassVar[int | None] = None
     masks_actions: ClassVar[bool] = False
+    takes_wrappers: ClassVar[bool] = False
     references: ClassVar[dict[str, Reference]] = {}
     published: ClassVar[tuple[PublishedScores, ...]] = ()
 

@@ -25,6 +25,7 @@ from switchmt_snn.acting.evaluation import (
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
+from switchmt_snn.export.folded import fold_agent, metadata
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.atari import AtariSuite
@@ -121,6 +122,18 @@ def test_agent_acts_on_one_observation_and_on_batches() -> None:
         agent.q_values(batch[0], 2)
     with pytest.raises(TaskError, match="has shape"):
         agent.act(batch[0, 0], "asterix")
+
+
+def test_an_agent_acts_as_the_environment_counts_actions() -> None:
+    config = small_config(tasks={"suite": "gym", "names": ["tests.tasks.odd_envs:Offset-v0"]})
+    suite = make_suite(config.tasks)
+    agent = Agent(build_network(config.network, observation_spec(suite), 3), suite, config, torch.device("cpu"), 12)
+    batch = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    greedy = agent.q_values(batch, 0).argmax(axis=1)
+    assert set(agent.act(batch, 0)) <= {-1, 0, 1}
+    assert np.array_equal(agent.act(batch, 0), greedy - 1)
+    assert agent.act(batch[0], 0) == greedy[0] - 1
+    assert metadata(fold_agent(agent))["first_actions"] == {"tests.tasks.odd_envs:Offset-v0": -1}
 
 
 def test_protocol_is_said_in_words() -> None:

@@ -15,12 +15,15 @@ from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
 from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.learning.switching import SwitchingPolicy
 from switchmt_snn.replay.ring import FrameReplay
-from switchmt_snn.runs.files import file_name
+from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.runs.run import train
+from switchmt_snn.tasks.gym_make import make_environment
 
 EXAMPLES: tuple[Any, ...] = (
     load_config,
     file_name,
+    json_text,
+    make_environment,
     train,
     Agent.act,
     FrameReplay,

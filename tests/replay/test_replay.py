@@ -274,7 +274,7 @@ def test_noise_stays_below_the_cap_and_what_is_left_is_right() -> None:
         lane, frame = int(rng.integers(2)), rng.integers(0, 256, shape, np.uint8)
         frames[lane][float(step)] = frame
         replay.add(lane, 0, step, False, frame)
-        largest = max(largest, replay.nbytes - 9 * 1200)
+        largest = max(largest, replay.nbytes - 11 * 1200)
         if step == 1500:
             copy = FrameReplay(1200, 2, shape, np.uint8, 3, compressed=True, max_bytes=cap)
             copy.load_state_dict(replay.state_dict())

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import math
 import re
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from switchmt_snn.runs.files import file_name
+from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.tasks.registry import SUITES
 
 TASKS = st.one_of(
@@ -35,3 +37,12 @@ def test_names_of_known_tasks_stay_as_they_are() -> None:
     for suite in SUITES.values():
         assert all(file_name(task) == task for task in suite.known_tasks() if not set(task) & set("/:"))
     assert file_name("breakout", "pong") == "breakout+pong"
+
+
+def test_json_holds_no_number_that_json_does_not_know() -> None:
+    values = {"a": [1.5, math.nan, (math.inf, -math.inf)], "b": {"c": None, "d": "NaN"}}
+    text = json_text(values, indent=1)
+    assert json.loads(text, parse_constant=lambda name: 1 / 0) == {
+        "a": [1.5, None, [None, None]],
+        "b": {"c": None, "d": "NaN"},
+    }

@@ -1,0 +1,126 @@
+"""What environments return, compared with what their suite declares: at every reset and every step of every play."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.config.plugins import failure
+from switchmt_snn.errors import SwitchMTError, TaskError
+from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
+
+METHODS = {
+    "reset": "reset(env_ids, seeds) -> frames; of a Gymnasium environment, reset(seed=...) -> (observation, info)",
+    "step": "step(actions) -> VectorStep; of a Gymnasium environment, step(action) -> (observation, reward, "
+    "terminated, truncated, info)",
+    "close": "close()",
+}
+"""What environments must have, in words."""
+
+LARGEST_REWARD = float(np.finfo(np.float32).max)
+"""Replay memories hold rewards as float32."""
+
+
+class CheckedEnvironment:
+    """A task's environments (a ``TaskEnvironment``); what they return is what the suite says, or a ``TaskError``.
+
+    Checked: ``num_envs`` and the methods; shape, dtype and range of frames; rewards that are finite; a value per copy.
+    An exception in the environment's own code becomes one line, too.
+    """
+
+    def __init__(self, tasks: TaskSuite, task: int, num_envs: int) -> None:
+        """Make the environments.
+
+        Raises:
+            TaskError: they cannot be made, or lack ``num_envs`` or a method.
+        """
+        self.num_envs = num_envs
+        self._tasks, self._name = tasks, tasks.names[task]
+        self._dtype = np.dtype(tasks.frame_dtype)
+        with self._code("make", "make(task, num_envs) -> the copies of a task"):
+            self._environment = tasks.make(task, num_envs)
+        seen = f"task {self._name!r} is played by {type(self._environment).__name__}, which has"
+        for method, expected in METHODS.items():
+            if not callable(getattr(self._environment, method, None)):
+                raise TaskError(f"{seen} no {method}, expected {expected}")
+        count = getattr(self._environment, "num_envs", None)
+        if count != num_envs:
+            raise TaskError(f"{seen} num_envs {count!r}, expected the {num_envs} that make was asked for")
+
+    def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> Frames:
+        """Start new episodes in some copies.
+
+        Raises:
+            TaskError: the environment fails, or its frames are not what the suite says.
+        """
+        with self._code("reset", METHODS["reset"]):
+            frames = self._environment.reset(env_ids, seeds)
+        self._require_frames(frames, len(env_ids))
+        return frames
+
+    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
+        """Step all copies.
+
+        Raises:
+            TaskError: the environment fails, or what it returns is not what the suite says.
+        """
+        with self._code("step", METHODS["step"]):
+            result = self._environment.step(actions)
+        if not isinstance(result, VectorStep):
+            raise TaskError(f"task {self._name!r} gave a {type(result).__name__} from step, expected a VectorStep")
+        self._require_frames(result.frames, self.num_envs)
+        for name, kinds in (("rewards", "fiu"), ("terminated", "b"), ("truncated", "b"), ("lives_lost", "b")):
+            values = getattr(result, name)
+            if name == "lives_lost" and values is None:
+                continue
+            if np.shape(values) != (self.num_envs,) or np.asarray(values).dtype.kind not in kinds:
+                raise TaskError(
+                    f"task {self._name!r} gave {name} = {values!r}, expected an array of {self.num_envs} "
+                    f"{'truth values' if kinds == 'b' else 'numbers'}, one for each copy"
+                )
+        if not (np.abs(result.rewards) <= LARGEST_REWARD).all():
+            raise TaskError(
+                f"task {self._name!r} gave the rewards {np.asarray(result.rewards).tolist()}, expected finite numbers "
+                "(float32); mend the environment's reward"
+            )
+        return result
+
+    def close(self) -> None:
+        """Free the copies."""
+        self._environment.close()
+
+    @contextmanager
+    def _code(self, where: str, expected: str) -> Iterator[None]:
+        """Around a call of code from outside: what it raises becomes one line."""
+        try:
+            yield
+        except SwitchMTError:
+            raise
+        except Exception as error:
+            raise TaskError(f"task {self._name!r} fails in {where} ({failure(error)}), expected {expected}") from error
+
+    def _require_frames(self, frames: Frames, count: int) -> None:
+        if not isinstance(frames, np.ndarray):
+            raise TaskError(f"task {self._name!r} gave a {type(frames).__name__} as frames, expected an array")
+        tasks, shape = self._tasks, (count, *self._tasks.frame_shape)
+        if frames.shape != shape or frames.dtype != self._dtype:
+            raise TaskError(
+                f"task {self._name!r} gave frames of shape {frames.shape} and type {frames.dtype}, expected {shape} "
+                f"and {self._dtype}, as the suite says"
+            )
+        if self._dtype == np.uint8 and (not tasks.in_unit_range or 255 * tasks.scale <= 1):
+            return
+        low, high = float(frames.min()) * tasks.scale, float(frames.max()) * tasks.scale  # NaN if one value is
+        if not (np.isfinite(low) and np.isfinite(high)):
+            raise TaskError(
+                f"task {self._name!r} gave observations from {low:g} to {high:g}, expected finite numbers (float32); "
+                "mend the environment's observation"
+            )
+        if tasks.in_unit_range and (low < 0 or high > 1):
+            raise TaskError(
+                f"task {self._name!r} gave scaled frames from {low:g} to {high:g}, expected values from 0 to 1; change "
+                "scale or in_unit_range"
+            )

@@ -1,0 +1,151 @@
+"""Gymnasium environments by task name, within the wrappers that a config asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from switchmt_snn.config.plugins import failure, import_plugin_module, is_plugin, load_plugin
+from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
+from switchmt_snn.errors import TaskError, did_you_mean
+from switchmt_snn.tasks.gym_copies import Env
+
+MOST_COMBINATIONS = 512
+"""Most actions that ``FlattenAction`` makes: a Q-network has an output for each."""
+
+
+class FlattenAction(gymnasium.ActionWrapper[Any, int, Any]):
+    """One action for every combination of a ``MultiDiscrete`` or ``MultiBinary`` space; the last component moves first.
+
+    Action a of ``MultiDiscrete([2, 3])`` is ``(a // 3, a % 3)``, plus the space's ``start``.
+    """
+
+    def __init__(self, env: Env) -> None:
+        """Wrap an environment.
+
+        Raises:
+            TaskError: another action space, or more than ``MOST_COMBINATIONS`` combinations.
+        """
+        super().__init__(env)
+        space = env.action_space
+        if isinstance(space, gymnasium.spaces.MultiDiscrete):
+            sizes, self._start = np.asarray(space.nvec), np.asarray(space.start)
+        elif isinstance(space, gymnasium.spaces.MultiBinary):
+            sizes = np.full(space.shape, 2)
+            self._start = np.zeros(space.shape, np.int64)
+        else:
+            raise TaskError(f"FlattenAction meets the action space {space}, expected MultiDiscrete or MultiBinary")
+        self._shape, self._dtype = sizes.shape, space.dtype
+        self._sizes = tuple(int(size) for size in sizes.reshape(-1))
+        count = int(np.prod(np.asarray(self._sizes, np.float64)))
+        if count > MOST_COMBINATIONS:
+            raise TaskError(
+                f"FlattenAction would make {count:,} actions of {space}, expected at most {MOST_COMBINATIONS}; choose "
+                "some of them in a wrapper of your own (gymnasium.ActionWrapper; tasks.wrappers=[module:Name])"
+            )
+        self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(count)
+
+    def action(self, action: int) -> Any:
+        """The combination that an action stands for."""
+        parts = np.asarray(np.unravel_index(int(action), self._sizes)).reshape(self._shape)
+        return (parts + self._start).astype(self._dtype)
+
+
+WRAPPERS: dict[str, Callable[[Env], Env]] = {
+    "FlattenObservation": gymnasium.wrappers.FlattenObservation,
+    "FlattenAction": FlattenAction,
+}
+"""What ``tasks.wrappers`` names without a module: ``BUILT_IN_WRAPPERS`` of the config."""
+assert tuple(WRAPPERS) == BUILT_IN_WRAPPERS
+
+
+def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
+    """One environment of the gym suite, as training plays it.
+
+    Args:
+        name: ``EnvId``, or ``module:EnvId``, which imports ``module`` first, as Gymnasium does.
+        wrappers: as ``tasks.wrappers``: ``FlattenObservation``, ``FlattenAction``, or ``module:Name``; the first is the
+            innermost.
+
+    Raises:
+        TaskError: the id is unknown, or the environment or a wrapper cannot be made.
+
+    Example:
+        >>> make_environment("Blackjack-v1", ["FlattenObservation"]).observation_space.shape
+        (45,)
+    """
+    module, colon, env_id = name.partition(":")
+    if colon:
+        _import(name, module)
+    try:
+        env: Env = gymnasium.make(env_id if colon else name)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise TaskError(f"task {name!r} needs a package that is not installed ({error})") from error
+    except ImportError as error:
+        raise TaskError(f"task {name!r} cannot be made ({error}), expected all its packages; install them") from error
+    except gymnasium.error.UnregisteredEnv as error:
+        raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{_hint(name)}") from error
+    except Exception as error:  # whatever the environment's own code raises
+        raise TaskError(
+            f"task {name!r} cannot be made ({failure(error)}), expected a Gymnasium environment with observation_space "
+            "and action_space"
+        ) from error
+    for wrapper in wrappers:
+        env = _wrapped(name, env, wrapper)
+    return env
+
+
+def _wrapped(name: str, env: Env, wrapper: str) -> Env:
+    make = load_plugin(wrapper, "tasks.wrappers") if is_plugin(wrapper) else WRAPPERS[wrapper]
+    try:
+        wrapped = make(env)
+    except TaskError as error:
+        raise TaskError(f"task {name!r}: {error}") from error
+    except Exception as error:  # whatever the wrapper's own code raises
+        raise TaskError(
+            f"task {name!r} does not take the wrapper {wrapper} ({failure(error)}), expected one for "
+            f"{env.observation_space} and {env.action_space}"
+        ) from error
+    if not isinstance(wrapped, gymnasium.Env):
+        raise TaskError(
+            f"tasks.wrappers has {wrapper}, which made a {type(wrapped).__name__}, expected a gymnasium.Env"
+        )
+    return wrapped
+
+
+def _import(name: str, module: str) -> None:
+    try:
+        import_plugin_module(module)
+    except ImportError as error:
+        missing = getattr(error, "name", None)
+        itself = missing is not None and f"{module}.".startswith(f"{missing}.")
+        remedy = (
+            "install it, or add its folder to PYTHONPATH" if itself else "mend the module, or install what it needs"
+        )
+        raise TaskError(
+            f"tasks.names has {name!r}, expected an importable module before the colon, but importing {module!r} fails "
+            f"({error}); {remedy}"
+        ) from error
+
+
+def _hint(name: str) -> str:
+    """Near ids: after ``module:``, of those whose class lies in the module."""
+    module, colon, _ = name.partition(":")
+    if not colon:
+        return f"{did_you_mean(name, gymnasium.registry)}; an id that another package registers is named package:Id"
+    own = [
+        f"{module}:{env_id}"
+        for env_id, spec in gymnasium.registry.items()
+        if (
+            spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
+        ).partition(":")[0]
+        == module
+    ]
+    return (
+        did_you_mean(name, own)
+        if own
+        else f"; {module!r} registers none of its classes; call gymnasium.register(id, MyEnv, max_episode_steps=...)"
+    )

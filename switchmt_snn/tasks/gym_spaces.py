@@ -1,0 +1,139 @@
+"""What the spaces of a Gymnasium environment mean here: actions, and how an observation becomes a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.errors import TaskError
+
+ImageLayout = Literal["by_shape", "channels_last", "channels_first"]
+FEW_CHANNELS = 4
+"""Most channels that an image is expected to have where only its shape tells which axis they are."""
+
+
+@dataclass(frozen=True)
+class FrameLayout:
+    """How observations become frames.
+
+    Attributes:
+        kind: of observations: ``vector``, ``channels_last`` (``[H, W, c]``), ``channels_first`` (``[c, H, W]``) or
+            ``grey`` (``[H, W]``).
+        shape: of a frame: ``(features,)`` or ``(c, H, W)``.
+        scale: factor to the network's input range.
+    """
+
+    kind: Literal["vector", "channels_last", "channels_first", "grey"]
+    shape: tuple[int, ...]
+    scale: float
+
+    @property
+    def is_image(self) -> bool:
+        """Whether frames are ``(c, H, W)``."""
+        return len(self.shape) == 3
+
+    def frame(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """An observation as a frame."""
+        if self.kind == "channels_last":
+            return np.moveaxis(observation, -1, 0)
+        return observation[None] if self.kind == "grey" else observation
+
+
+def channels_last(observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """``[H, W, c]`` -> ``[c, H, W]``."""
+    return np.moveaxis(observation, -1, 0)
+
+
+def frame_layout(name: str, space: gymnasium.Space[Any], image_layout: ImageLayout) -> FrameLayout:
+    """How observations of a space become frames.
+
+    Args:
+        name: of the task, for errors.
+        space: ``observation_space``.
+        image_layout: where the channels of images are; ``by_shape`` tells it from the shape, or refuses.
+
+    Raises:
+        TaskError: no ``Box`` of one to three dimensions, an image that is not uint8 or bool, or an image whose shape
+            does not say which axis holds the channels.
+    """
+    if not isinstance(space, gymnasium.spaces.Box):
+        raise TaskError(f"task {name!r} observes {_short(space)}, expected a Box; {_remedy(space)}")
+    shape = tuple(int(side) for side in space.shape)
+    if not (1 <= len(shape) <= 3 and all(shape)):
+        raise TaskError(
+            f"task {name!r} observes {_short(space)}, expected a vector or an image (one to three dimensions, none "
+            f"empty); {FLATTEN}"
+        )
+    kind = np.dtype(space.dtype).kind if space.dtype is not None else "f"
+    if len(shape) == 1:
+        if kind not in "biuf":
+            raise TaskError(f"task {name!r} observes {_short(space)}, expected numbers")
+        return FrameLayout("vector", shape, 1.0)
+    if not (space.dtype == np.uint8 or kind == "b"):
+        raise TaskError(
+            f"task {name!r} observes {_short(space)}, expected uint8 or bool: {len(shape)} dimensions are taken for an "
+            f"image; if they are none, {FLATTEN}; if they are, wrap the environment to return uint8"
+        )
+    scale = 1.0 if kind == "b" else 1.0 / 255.0
+    if len(shape) == 2:
+        return FrameLayout("grey", (1, *shape), scale)
+    if image_layout == "by_shape":
+        image_layout = _layout_of(name, shape)
+    if image_layout == "channels_first":
+        return FrameLayout("channels_first", shape, scale)
+    return FrameLayout("channels_last", (shape[2], *shape[:2]), scale)
+
+
+FLATTEN = "set tasks.wrappers=[FlattenObservation]"
+
+
+def _layout_of(name: str, shape: tuple[int, ...]) -> ImageLayout:
+    """Channels are the axis beside two equal sides, or the only end that is at most 4; if the two disagree: refused."""
+    first, middle, last = shape
+    signs: set[ImageLayout] = set()
+    if first == middle != last:
+        signs.add("channels_last")
+    if last == middle != first:
+        signs.add("channels_first")
+    if last <= FEW_CHANNELS < first:
+        signs.add("channels_last")
+    if first <= FEW_CHANNELS < last:
+        signs.add("channels_first")
+    if len(signs) != 1:
+        raise TaskError(
+            f"task {name!r} observes images of shape {shape}, which does not say which axis holds the channels; set "
+            "tasks.image_layout to channels_last or channels_first"
+        )
+    return signs.pop()
+
+
+def num_actions(name: str, space: gymnasium.Space[Any]) -> int:
+    """Actions of a task.
+
+    Raises:
+        TaskError: they are not ``Discrete``.
+    """
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return int(space.n)
+    remedy = "choose some actions in a wrapper of your own (gymnasium.ActionWrapper; tasks.wrappers=[module:Name])"
+    if isinstance(space, (gymnasium.spaces.MultiDiscrete, gymnasium.spaces.MultiBinary)):
+        remedy = "set tasks.wrappers=[FlattenAction], which makes one action of every combination"
+    raise TaskError(
+        f"task {name!r} has the action space {_short(space)}, expected Discrete: a Q-network lists actions; {remedy}"
+    )
+
+
+def _remedy(space: gymnasium.Space[Any]) -> str:
+    if space.is_np_flattenable:
+        return FLATTEN
+    return "choose its numbers in a wrapper of your own (gymnasium.ObservationWrapper; tasks.wrappers=[module:Name])"
+
+
+def _short(space: gymnasium.Space[Any]) -> str:
+    """A space in one short line."""
+    text = " ".join(str(space).split())
+    return text if len(text) <= 120 else f"{text[:117]}..."

@@ -1,0 +1,44 @@
+"""The global random generators, for environments that draw from them: an episode is a function of its seed."""
+
+from __future__ import annotations
+
+import random
+import threading
+from types import TracebackType
+
+import numpy as np
+from numpy.random import mtrand
+
+_ONE_AT_A_TIME = threading.RLock()
+
+
+class OwnGenerators:
+    """The global generators of ``random`` and ``numpy.random``, as one environment finds them; a context manager.
+
+    Within it they are as this environment left them (after ``seed``, freshly seeded), whatever drew from them
+    meanwhile; outside they are as everybody else left them. Two threads are never within at the same time.
+    """
+
+    def __init__(self) -> None:
+        self._others_python = random.getstate()
+        self._others_numpy = mtrand.get_bit_generator()
+        self.seed(0)
+
+    def seed(self, seed: int) -> None:
+        """Seed both, for the next entry."""
+        self._python = random.Random(seed).getstate()
+        self._numpy: np.random.BitGenerator = np.random.MT19937(seed)
+
+    def __enter__(self) -> None:
+        _ONE_AT_A_TIME.acquire()
+        self._others_python, self._others_numpy = random.getstate(), mtrand.get_bit_generator()
+        random.setstate(self._python)
+        mtrand.set_bit_generator(self._numpy)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._python, self._numpy = random.getstate(), mtrand.get_bit_generator()
+        random.setstate(self._others_python)
+        mtrand.set_bit_generator(self._others_numpy)
+        _ONE_AT_A_TIME.release()

@@ -1,0 +1,248 @@
+"""Gymnasium environments that people write: right ones of unusual form, and wrong ones."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
+
+
+class Plain(gymnasium.Env):  # type: ignore[type-arg]
+    """Four equal numbers that count steps; action 1 of three is rewarded; episodes of 30 steps."""
+
+    observation_space: gymnasium.Space[Any] = Box(-10.0, 10.0, (4,), np.float32)
+    action_space: gymnasium.Space[Any] = Discrete(3)
+    length = 30
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.observe(), {}
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        self.steps += 1
+        return self.observe(), self.reward(action), self.steps >= self.length, False, {}
+
+    def observe(self) -> Any:
+        return np.full(4, self.steps / 10, np.float32)
+
+    def reward(self, action: Any) -> Any:
+        return float(action == 1)
+
+
+def later(right: Any, wrong: Any, env: Plain) -> Any:
+    """Right for 25 steps: longer than a run's first check plays."""
+    return wrong if env.steps > 25 else right
+
+
+class ShortObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), np.zeros(2, np.float32), self)
+
+
+class LongObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), np.zeros(9, np.float32), self)
+
+
+class TextObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), np.asarray(["a"] * 4), self)
+
+
+class NanObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), np.asarray([0, np.nan, 0, 0], np.float32), self)
+
+
+class HugeObservation(Plain):
+    """Finite in float64, infinite in float32."""
+
+    def observe(self) -> Any:
+        return later(super().observe(), np.full(4, 1e300), self)
+
+
+class NanReward(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0.0, float("nan"), self)
+
+
+class InfiniteReward(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0.0, float("inf"), self)
+
+
+class HugeReward(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0.0, -1e39, self)
+
+
+class TextReward(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0.0, "1", self)
+
+
+class ListReward(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0.0, [1.0], self)
+
+
+class Raises(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0, 1, self) and 1 / 0
+
+
+class DoubleObservation(Plain):
+    """float64 and whole numbers for a float32 space: every value has its float32."""
+
+    def observe(self) -> Any:
+        return [self.steps, 0.5, 1, 2]
+
+
+class WideByte(Plain):
+    """int64 for a uint8 space."""
+
+    observation_space = Box(0, 255, (8, 8, 3), np.uint8)
+
+    def observe(self) -> Any:
+        return later(np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 300), self)
+
+
+class Offset(Plain):
+    """Actions -1, 0 and 1."""
+
+    action_space = Discrete(3, start=-1)
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        assert action in (-1, 0, 1)
+        return super().step(action)
+
+
+class ManyActions(Plain):
+    action_space = Discrete(40_000)
+
+    def reward(self, action: Any) -> Any:
+        return float(action)
+
+
+class ChannelsFirst(Plain):
+    """Channel c holds c, row h holds 10 h."""
+
+    observation_space = Box(0, 255, (4, 10, 10), np.uint8)
+
+    def observe(self) -> Any:
+        return (np.arange(4)[:, None, None] + 10 * np.arange(10)[None, :, None] + np.zeros((1, 1, 10))).astype(np.uint8)
+
+
+class ChannelsLast(ChannelsFirst):
+    observation_space = Box(0, 255, (10, 10, 4), np.uint8)
+
+    def observe(self) -> Any:
+        return np.moveaxis(super().observe(), 0, -1)
+
+
+class AnyAxis(Plain):
+    """Ten channels of 10 by 10: only its author knows which axis they are."""
+
+    observation_space = Box(0, 255, (10, 10, 10), np.uint8)
+
+    def observe(self) -> Any:
+        return np.broadcast_to(np.arange(10, dtype=np.uint8), (10, 10, 10))
+
+
+class Planes(Plain):
+    """Truth values, as MinAtar's own ids give them."""
+
+    observation_space = Box(0, 1, (10, 10, 4), np.bool_)
+
+    def observe(self) -> Any:
+        return np.ones((10, 10, 4), np.bool_)
+
+
+class FloatGrid(Plain):
+    observation_space = Box(0.0, 1.0, (5, 5), np.float32)
+
+    def observe(self) -> Any:
+        return np.full((5, 5), 0.5, np.float32)
+
+
+class Composed(Plain):
+    """A dict of an image, a state and a pair."""
+
+    observation_space = Dict(
+        {"image": Box(0, 255, (3, 3), np.uint8), "state": Discrete(3), "pair": Tuple((Discrete(2), Discrete(2)))}
+    )
+
+    def observe(self) -> Any:
+        return {"image": np.full((3, 3), 7, np.uint8), "state": 2, "pair": (1, 0)}
+
+
+class Combined(Plain):
+    """Two components, rewarded as 10 first + second; the second begins at 1."""
+
+    action_space = MultiDiscrete([2, 3], start=[0, 1])
+
+    def reward(self, action: Any) -> Any:
+        return float(10 * action[0] + action[1])
+
+
+class TooManyCombinations(Plain):
+    action_space = MultiDiscrete([30, 30])
+
+
+class GlobalRandom(Plain):
+    """Draws from the process-wide generators, which reset's seed does not reach."""
+
+    def reward(self, action: Any) -> Any:
+        return random.random() + np.random.rand() + float(np.random.randn())
+
+
+class SampledActions(Plain):
+    """Draws from its spaces, which reset's seed does not reach either."""
+
+    def reward(self, action: Any) -> Any:
+        return float(self.action_space.sample()) + float(self.observation_space.sample()[0])
+
+
+class OwnUnseeded(Plain):
+    """A generator of its own, which nothing seeds."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng()
+
+    def reward(self, action: Any) -> Any:
+        return self.rng.random()
+
+
+class SharedState(Plain):
+    """Counts the steps of all copies together."""
+
+    count = 0
+
+    def reward(self, action: Any) -> Any:
+        type(self).count += 1
+        return float(type(self).count % 7)
+
+
+class Endless(Plain):
+    length = 10**12
+
+
+class Halves(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
+    """A wrapper of one's own."""
+
+    def observation(self, observation: Any) -> Any:
+        return observation / 2
+
+
+def register() -> None:
+    """Make every class known to Gymnasium as ``Name-v0``."""
+    for value in list(globals().values()):
+        if isinstance(value, type) and issubclass(value, Plain):
+            gymnasium.register(f"{value.__name__}-v0", value, max_episode_steps=None)
+
+
+register()

@@ -1,0 +1,227 @@
+"""Gymnasium environments of other people: what they return, how actions count, images, randomness, wrappers."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from switchmt_snn.config import TasksConfig
+from switchmt_snn.errors import ConfigError, TaskError
+from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.play import Play
+from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.tasks.suite import TaskSuite
+
+MODULE = "tests.tasks.odd_envs"
+
+
+def suite_of(*names: str, **settings: Any) -> TaskSuite:
+    return make_suite(TasksConfig(suite="gym", names=tuple(f"{MODULE}:{name}-v0" for name in names), **settings))
+
+
+def begun(suite: TaskSuite, num_envs: int = 1, seed: int = 3) -> Play:
+    play = Play(suite, 0, num_envs)
+    play.begin(np.arange(num_envs), seed + np.arange(num_envs))
+    return play
+
+
+def rewards(suite: TaskSuite, steps: int = 20, num_envs: int = 1) -> list[list[float]]:
+    """Of every step, all copies with action 0."""
+    play = begun(suite, num_envs)
+    return [play.step(np.zeros(num_envs, np.int64)).rewards.tolist() for _ in range(steps)]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "ShortObservation",
+            r"gave an observation of shape \(2,\), expected \(4,\), the shape of its obs",
+        ),
+        ("LongObservation", r"gave an observation of shape \(9,\), expected \(4,\)"),
+        ("TextObservation", "gave an observation of type <U1, expected float32, the type of its observation_space"),
+        ("NanObservation", "gave observations from nan to nan, expected finite numbers"),
+        ("HugeObservation", "gave observations from inf to inf, expected finite numbers"),
+        ("NanReward", r"gave the rewards \[nan\], expected finite numbers"),
+        ("InfiniteReward", r"gave the rewards \[inf\], expected finite numbers"),
+        ("HugeReward", r"gave the rewards \[-1e\+39\], expected finite numbers"),
+        ("TextReward", "gave reward = '1', expected one number"),
+        ("ListReward", r"gave reward = \[1\.0\], expected one number"),
+        ("WideByte", "gave an observation of type int64, expected uint8"),
+        ("Raises", r"fails in step \(ZeroDivisionError: division by zero at odd_envs.py, line \d+\)"),
+    ],
+)
+def test_what_an_environment_returns_is_compared_with_its_spaces_at_every_step(name: str, message: str) -> None:
+    play = begun(suite_of(name))
+    for _ in range(25):
+        play.step(np.asarray([0]))
+    with pytest.raises(TaskError, match=f"task '{MODULE}:{name}-v0' {message}") as caught:
+        play.step(np.asarray([0]))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore")  # Gymnasium's own checker asks for an array
+def test_numbers_that_a_space_can_hold_are_taken() -> None:
+    play = begun(suite_of("DoubleObservation"))
+    play.step(np.asarray([0]))
+    assert play.observations.tolist() == [[1.0, 0.5, 1.0, 2.0]]
+
+
+def test_actions_with_an_offset_reach_the_environment_as_it_counts_them() -> None:
+    suite = suite_of("Offset")
+    assert suite.action_names == ("action_-1", "action_0", "action_1")
+    play = begun(suite)
+    assert [float(play.step(np.asarray([action])).rewards[0]) for action in range(3)] == [0.0, 0.0, 1.0]
+
+
+def test_tasks_with_other_offsets_share_outputs_that_are_numbered() -> None:
+    suite = suite_of("Offset", "Plain")
+    assert suite.first_actions == (-1, 0)
+    assert [suite.first_action(task) for task in range(2)] == [-1, 0]
+    assert suite.action_names == ("output_0", "output_1", "output_2")
+
+
+def test_actions_beyond_16_bits_are_played_and_played_again() -> None:
+    suite = suite_of("ManyActions")
+    play = begun(suite)
+    assert play.step(np.asarray([39_999])).rewards[0] == 39_999
+    again = Play(suite, 0, 1)
+    assert again.load_state_dict(play.state_dict())
+    assert again.returns[0] == 39_999
+
+
+@pytest.mark.parametrize("name", ["ChannelsFirst", "ChannelsLast"])
+def test_the_shape_of_an_image_says_where_its_channels_are(name: str) -> None:
+    suite = suite_of(name)
+    assert suite.frame_shape == (4, 10, 10)
+    frame = begun(suite).observations[0]
+    assert frame[:, 0, 0].tolist() == [0, 1, 2, 3]
+    assert frame[0, :, 0].tolist() == list(range(0, 100, 10))
+
+
+def layout(shape: tuple[int, ...]) -> str:
+    from switchmt_snn.tasks.gym_spaces import frame_layout
+
+    return frame_layout("a", gymnasium.spaces.Box(0, 255, shape, np.uint8), "by_shape").kind
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((84, 84), "grey"),
+        ((84, 84, 3), "channels_last"),
+        ((210, 160, 3), "channels_last"),
+        ((10, 10, 7), "channels_last"),
+        ((5, 5, 16), "channels_last"),
+        ((84, 84, 1), "channels_last"),
+        ((4, 84, 84), "channels_first"),
+        ((3, 210, 160), "channels_first"),
+        ((16, 5, 5), "channels_first"),
+        ((7,), "vector"),
+    ],
+)
+def test_the_layout_that_a_shape_says(shape: tuple[int, ...], kind: str) -> None:
+    assert layout(shape) == kind
+
+
+@pytest.mark.parametrize("shape", [(10, 10, 10), (3, 5, 3), (4, 4, 10), (7, 3, 3), (10, 20, 12)])
+def test_a_shape_that_does_not_say_its_layout_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(TaskError, match=r"does not say which axis holds the channels; set tasks\.image_layout"):
+        layout(shape)
+
+
+def test_the_layout_of_an_image_can_be_stated() -> None:
+    last = begun(suite_of("AnyAxis", image_layout="channels_last")).observations[0]
+    first = begun(suite_of("AnyAxis", image_layout="channels_first")).observations[0]
+    assert last[:, 0, 0].tolist() == list(range(10))
+    assert first[0, 0].tolist() == list(range(10))
+
+
+def test_truth_values_are_frames_of_zeros_and_ones() -> None:
+    suite = suite_of("Planes")
+    assert (suite.scale, suite.in_unit_range) == (1.0, True)
+    assert begun(suite).observations.max() == 1
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            ("FloatGrid",),
+            r"expected uint8 or bool: 2 dimensions are taken for an image; if they are none, set task",
+        ),
+        (("Composed",), r"expected a Box; set tasks\.wrappers=\[FlattenObservation\]"),
+        (("Combined",), r"expected Discrete: .* set tasks\.wrappers=\[FlattenAction\]"),
+        (("Planes", "ChannelsLast"), "mix images of uint8 and of bool"),
+        (("Plain", "ChannelsLast"), "mix images and vectors"),
+    ],
+)
+def test_a_refusal_says_what_to_do(names: tuple[str, ...], message: str) -> None:
+    with pytest.raises(TaskError, match=message):
+        suite_of(*names)
+
+
+def test_composed_observations_are_flattened_on_request() -> None:
+    suite = suite_of("Composed", wrappers=("FlattenObservation",))
+    assert suite.frame_shape == (16,)
+    assert begun(suite).observations[0].tolist() == [7.0] * 9 + [0, 1, 1, 0] + [0, 0, 1]
+
+
+def test_every_combination_of_a_small_multidiscrete_space_is_an_action_on_request() -> None:
+    suite = suite_of("Combined", wrappers=("FlattenAction",))
+    assert suite.num_actions == 6
+    play = begun(suite)
+    seen = [float(play.step(np.asarray([action])).rewards[0]) for action in range(6)]
+    assert seen == [1.0, 2.0, 3.0, 11.0, 12.0, 13.0]
+
+
+def test_too_many_combinations_are_refused() -> None:
+    with pytest.raises(TaskError, match=r"would make 900 actions of MultiDiscrete.*expected at most 512; choose some"):
+        suite_of("TooManyCombinations", wrappers=("FlattenAction",))
+
+
+def test_a_wrapper_of_ones_own_is_named_by_its_module() -> None:
+    play = begun(suite_of("Plain", wrappers=(f"{MODULE}:Halves",)))
+    play.step(np.asarray([0]))
+    assert play.observations[0, 0] == np.float32(0.05)
+    assert make_environment("CartPole-v1", (f"{MODULE}:Halves",)).spec is not None
+
+
+def test_wrappers_that_do_not_exist_or_do_not_fit_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"tasks\.wrappers is 'FlatenAction'.*did you mean 'FlattenAction'"):
+        TasksConfig(suite="gym", names=("CartPole-v1",), wrappers=("FlatenAction",))
+    with pytest.raises(TaskError, match="FlattenAction meets the action space Discrete"):
+        suite_of("Plain", wrappers=("FlattenAction",))
+    with pytest.raises(ConfigError, match=r"tasks\.wrappers is .*expected the default for the suite 'minatar'"):
+        make_suite(TasksConfig(suite="minatar", names=("breakout",), wrappers=("FlattenObservation",)))
+
+
+@pytest.mark.parametrize("name", ["GlobalRandom", "SampledActions"])
+def test_episodes_that_draw_from_global_generators_are_functions_of_their_seed(name: str) -> None:
+    suite = suite_of(name)
+    alone = rewards(suite)
+    assert rewards(suite) == alone
+    assert [row[0] for row in rewards(suite, num_envs=3)] == [row[0] for row in alone]
+    assert len({row[0] for row in alone}) > 1
+
+
+def test_the_global_generators_of_everybody_else_stay_as_they_are() -> None:
+    random.seed(5)
+    np.random.seed(5)
+    expected = (random.random(), np.random.rand(), np.random.randn())
+    random.seed(5)
+    np.random.seed(5)
+    play = begun(suite_of("GlobalRandom"))
+    play.step(np.asarray([0]))
+    assert (random.random(), np.random.rand(), np.random.randn()) == expected
+
+
+def test_only_environments_of_gymnasium_itself_are_played_in_several_threads() -> None:
+    assert make_suite(TasksConfig(suite="gym", names=("CartPole-v1",))).thread_safe
+    assert not suite_of("Plain").thread_safe
+    wrapped = TasksConfig(suite="gym", names=("CartPole-v1",), wrappers=(f"{MODULE}:Halves",))
+    assert not make_suite(wrapped).thread_safe
