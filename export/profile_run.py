@@ -132,7 +132,12 @@ def profile(
 
 
 def profile_file(
-    file: str | Path, observations: str | Path, out: str | Path | None = None, targets: Sequence[str | Path] = ()
+    file: str | Path,
+    observations: str | Path,
+    out: str | Path | None = None,
+    targets: Sequence[str | Path] = (),
+    reset: str | None = None,
+    fires_at_threshold: bool = False,
 ) -> ProfileResult:
     """``profile`` of a NIR file on stored observations (``switchmt_snn.export.counts.nir_file.count_nir``).
 
@@ -141,6 +146,8 @@ def profile_file(
         observations: an .npz file.
         out: where; None takes ``FILE-profile/`` beside the file.
         targets: as in ``profile``; chips are for runs only.
+        reset: see ``count_nir``.
+        fires_at_threshold: see ``count_nir``.
 
     Raises:
         ConfigError: a target that is not one.
@@ -150,12 +157,14 @@ def profile_file(
     if targets and selection.chips:
         names = ", ".join(chip.name for chip in selection.chips)
         raise ConfigError(f"{names} is a chip, expected energy targets for a NIR file; chips are checked for runs")
-    counted = count_nir(path, Path(observations))
+    counted = count_nir(path, Path(observations), reset, fires_at_threshold)
+    counts = counted.counts
     folder = _folder(Path(out) if out is not None else path.with_name(f"{path.stem}-profile"))
-    facts = {**provenance(), "run": path.name, "timesteps": counted.timesteps}
+    facts = {**provenance(), "run": path.name, "timesteps": counts.timesteps}
     facts |= {"chips": [], "precision_left_out": None, "decisions_per_s": None}
-    tasks = [_task_facts(counted, selection.targets, None, None)]
-    return _written(folder, (counted,), selection.targets, facts, tasks, ())
+    facts |= {"convention": asdict(counted.convention), "doubts": list(counted.doubts)}
+    tasks = [_task_facts(counts, selection.targets, None, None)]
+    return _written(folder, (counts,), selection.targets, facts, tasks, ())
 
 
 def compare_profiles(profiles: Iterable[ProfileResult], out: str | Path | None = None) -> Path:
@@ -198,7 +207,7 @@ def _written(
     summary = _summary(profiles, energies)
     facts = {
         "schema": SCHEMA,
-        "headline": _headline(profiles, [energy for _, energy in energies]),
+        "headline": " ".join([*facts.get("doubts", ()), _headline(profiles, [energy for _, energy in energies])]),
         "command": command_line(),
         "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         **facts,

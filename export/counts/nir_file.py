@@ -24,6 +24,7 @@ import torch
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.counts.network import LayerCounts, TaskCounts, layer_counts
+from switchmt_snn.export.counts.nir_convention import NirConvention, doubts, require_stable, stated
 from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
@@ -41,7 +42,22 @@ _FACTS = ("encoding", "timesteps", "observation_shape", "frame_stack", "scale")
 Array = npt.NDArray[Any]
 
 
-def count_nir(path: Path, observations: Path) -> TaskCounts:
+@dataclass(frozen=True)
+class NirCounts:
+    """What a NIR file did on given inputs.
+
+    Attributes:
+        counts: one layer per node with weights, in forward order. The task's name is the metadata's, or the file's.
+        convention: how it was simulated.
+        doubts: what looks wrong about that, in sentences; empty for a file of ours.
+    """
+
+    counts: TaskCounts
+    convention: NirConvention
+    doubts: tuple[str, ...]
+
+
+def count_nir(path: Path, observations: Path, reset: str | None = None, fires_at_threshold: bool = False) -> NirCounts:
     """Count what a NIR file does; the time is that of the interpreter, the memory that of the ``.npz``.
 
     Args:
@@ -50,16 +66,19 @@ def count_nir(path: Path, observations: Path) -> TaskCounts:
         observations: an ``.npz`` with either ``observations``, raw ``[N, *shape]`` (the graph must have this package's
             metadata), or ``inputs``, encoded ``[T, N, *shape of the Input node]``; and, before the ``dt`` of the
             graph's metadata, ``dt``, the length of a simulation step.
-
-    Returns:
-        One layer per node with weights, in forward order. The task's name is the metadata's, or the file's.
+        reset: what a spike does in the tool that wrote the file, one of
+            ``switchmt_snn.export.runtimes.nir_interpreter.RESETS``; None takes the metadata's, else NIR's.
+        fires_at_threshold: whether a membrane that is exactly at its threshold fires there.
 
     Raises:
-        ExportError: one of the files cannot be read, or they do not fit each other.
+        ExportError: one of the files cannot be read, they do not fit each other, dt is longer than a time constant, or
+            a convention was stated for a file of ours.
     """
     graph, stored = _graph(path), _arrays(observations)
     own = all(key in graph.metadata for key in _FACTS)
-    interpreter = NirInterpreter(graph, _dt(graph, stored), reset=str(graph.metadata.get("reset", "zero")))
+    convention = stated(graph, own, _dt(graph, stored), reset, fires_at_threshold)
+    require_stable(graph, convention.dt)
+    interpreter = NirInterpreter(graph, convention.dt, convention.reset, fires_at_threshold)
     shape = _sides(graph.nodes[interpreter.input].input_type["input"])
     if "inputs" in stored:
         inputs = _encoded(stored["inputs"], shape, graph.metadata if own else {})
@@ -79,7 +98,9 @@ def count_nir(path: Path, observations: Path) -> TaskCounts:
         for layer in layers:
             layer.add(recorded)
     task = str(graph.metadata.get("task", path.stem))
-    return TaskCounts(task, inputs.decisions, inputs.timesteps, True, tuple(layer.counts() for layer in layers))
+    counts = TaskCounts(task, inputs.decisions, inputs.timesteps, True, tuple(layer.counts() for layer in layers))
+    known = reset is not None or "reset" in graph.metadata
+    return NirCounts(counts, convention, () if own else doubts(graph, convention, inputs.timesteps, known))
 
 
 @dataclass(frozen=True)

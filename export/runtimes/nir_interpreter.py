@@ -21,6 +21,17 @@ Float = npt.NDArray[np.float32]
 Step = Callable[[Float], Float]
 Pair = tuple[int, int]
 """Vertical and horizontal."""
+RESETS = ("zero", "subtract", "subtract_after_decay")
+"""What a spike does to its membrane.
+
+========================  ==========================================================================================
+``zero``                  sets it to v_reset, as NIR defines it
+``subtract``              subtracts the threshold at once, so that what is left decays from the next step on (sinabs)
+``subtract_after_decay``  subtracts the threshold in the next step, after the decay (snnTorch's default)
+========================  ==========================================================================================
+
+Without a decay the two subtractions are the same.
+"""
 
 
 class NirInterpreter:
@@ -30,8 +41,7 @@ class NirInterpreter:
         graph: one Input, one Output; nodes Conv2d, Affine, Linear, Flatten, IF, LIF, CubaLIF, I, LI, Threshold,
             Scale.
         dt: length of a simulation step; None takes it from the graph's metadata.
-        reset: what a spike does to the membrane of IF and LIF nodes: ``zero`` (to v_reset, as NIR defines it) or
-            ``subtract`` (the threshold, as sinabs does).
+        reset: what a spike does to the membrane of IF, LIF and CubaLIF nodes, one of ``RESETS``.
         fires_at_threshold: whether v == threshold fires (``>=``); NIR defines ``>``.
         floor: whether membranes stay at or above minus the threshold (sinabs); NIR has no floor.
 
@@ -41,7 +51,7 @@ class NirInterpreter:
         geometry: stride and zero padding of each Conv2d node.
 
     Raises:
-        ExportError: the graph has nodes or a structure that is not known here.
+        ExportError: the graph has nodes or a structure that is not known here, or there is no such reset.
     """
 
     def __init__(
@@ -56,6 +66,8 @@ class NirInterpreter:
             if "dt" not in graph.metadata:
                 raise ExportError("the NIR graph's metadata has no dt, expected the length of a step; pass dt")
             dt = float(graph.metadata["dt"])
+        if reset not in RESETS:
+            raise ExportError(f"the reset of NIR neurons is {reset!r}, expected one of {', '.join(RESETS)}")
         self.graph, self.dt, self.reset, self.floor = graph, dt, reset, floor
         self._fires = np.greater_equal if fires_at_threshold else np.greater
         unknown = {type(node).__name__ for node in graph.nodes.values()} - {*_KNOWN, "Input", "Output"}
@@ -158,6 +170,8 @@ class _Membrane:
         rate = dt / node.tau.astype(np.float64) if self.leaky else dt * node.r.astype(np.float64)
         self.rate = rate.astype(np.float32)
         self.v: Float | None = None
+        self.owed: Float | None = None
+        """What the spikes of the last step take off after the decay."""
 
     def __call__(self, x: Float) -> Float:
         v = np.zeros_like(x) if self.v is None else self.v
@@ -166,9 +180,13 @@ class _Membrane:
         if not self.spiking:
             self.v = v
             return cast(Float, v)
+        if self.owed is not None:
+            v = v - self.owed
         fired = self.fires(v, self.node.v_threshold)
-        after = v - self.node.v_threshold if self.reset == "subtract" else np.broadcast_to(self.node.v_reset, v.shape)
-        v = np.where(fired, after, v)
+        if self.reset == "subtract_after_decay":
+            self.owed = fired * self.node.v_threshold
+        else:
+            v = np.where(fired, v - self.node.v_threshold if self.reset == "subtract" else self.node.v_reset, v)
         self.v = np.maximum(v, -self.node.v_threshold) if self.floor else v
         return cast(Float, fired.astype(np.float32))
 

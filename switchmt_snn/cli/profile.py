@@ -26,6 +26,11 @@ class ProfileOptions:
     """Which weights."""
     observations: Path | None = None
     """For a NIR file: an .npz file with observations [N, ...] or encoded inputs [T, N, ...]."""
+    reset: Literal["zero", "subtract", "subtract_after_decay"] | None = None
+    """For a NIR file of another tool: what a spike does there. zero: to v_reset (NIR). subtract: takes the threshold
+    off at once. subtract_after_decay: after the next decay (snnTorch's default). Default: the file's, else zero."""
+    fires_at_threshold: bool = False
+    """For a NIR file of another tool: a membrane exactly at its threshold fires (SpikingJelly, sinabs)."""
     out: Path | None = None
     """Folder to write to. Default: RUN/profile/; with several runs, the comparison goes into the first one's."""
     json: bool = False
@@ -47,6 +52,10 @@ def command(argv: list[str]) -> int:
         )
     if files and (options.decisions, options.checkpoint) != (ProfileOptions.decisions, ProfileOptions.checkpoint):
         raise ConfigError("--decisions and --checkpoint are for runs, expected neither with a NIR file; leave them out")
+    if not files and (options.reset is not None or options.fires_at_threshold):
+        raise ConfigError(
+            "--reset and --fires-at-threshold are for NIR files, expected neither for a run; leave them out"
+        )
     for path in set(names) - set(files):  # all of them, before the first is profiled
         RunFolder(Path(path)).require()
     profiles: list[ProfileResult] = []
@@ -55,7 +64,16 @@ def command(argv: list[str]) -> int:
     chosen: list[str | None] = [*names] or [None]  # None is the newest run
     for name in chosen:
         if name is not None and name in files:
-            profiles.append(profile_file(name, cast(Path, options.observations), out, options.target))
+            profiles.append(
+                profile_file(
+                    name,
+                    cast(Path, options.observations),
+                    out,
+                    options.target,
+                    options.reset,
+                    options.fires_at_threshold,
+                )
+            )
         else:
             profiles.append(profile(name, options.decisions, options.checkpoint, out, options.target))
     report = profiles[0].folder / "report.html"

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from switchmt_snn.errors import ExportError
-from switchmt_snn.export.counts.network import count_task
+from switchmt_snn.export.counts.network import TaskCounts, count_task
 from switchmt_snn.export.counts.nir_file import count_nir
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
@@ -24,6 +24,11 @@ from switchmt_snn.export.parity.dyadic import dyadic_observations, exact_copy
 from switchmt_snn.export.runtimes.agents import encode
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
 from tests.export.export_cases import VARIANTS, make_agent, observations
+
+
+def counted(path: Path, observations: Path) -> TaskCounts:
+    return count_nir(path, observations).counts
+
 
 INTEGERS = (-3, 4)
 """Weights and inputs whose sums float32 holds exactly."""
@@ -167,7 +172,7 @@ def test_own_files_count_like_the_network(variant: str, exported, tmp_path: Path
     agent, x, path = exported(variant)
     assert len(x) > 32, "more than one chunk"
     expected = count_task(agent, 1, x)
-    seen = count_nir(path, saved(tmp_path / "x.npz", observations=x))
+    seen = counted(path, saved(tmp_path / "x.npz", observations=x))
     assert (seen.task, seen.decisions, seen.timesteps, seen.spiking) == ("asterix", 40, expected.timesteps, True)
     assert all(sum(layer.spikes_T) > 0 for layer in expected.layers[:-1]), "a silent layer proves nothing"
     assert len(seen.layers) == len(expected.layers)
@@ -179,7 +184,7 @@ def test_own_files_count_like_the_network(variant: str, exported, tmp_path: Path
 @pytest.mark.parametrize(("variant", "profile"), [("LIF", "legacy"), ("subtract", "legacy"), ("LIF", "spikingjelly")])
 def test_other_profiles_count_the_same(variant: str, profile: str, exported, tmp_path: Path) -> None:
     agent, x, path = exported(variant, profile)
-    seen, expected = count_nir(path, saved(tmp_path / "x.npz", observations=x)), count_task(agent, 1, x)
+    seen, expected = counted(path, saved(tmp_path / "x.npz", observations=x)), count_task(agent, 1, x)
     assert [layer.effective_T for layer in seen.layers] == [layer.effective_T for layer in expected.layers]
     assert [layer.spikes_T for layer in seen.layers] == [layer.spikes_T for layer in expected.layers]
 
@@ -188,12 +193,12 @@ def test_other_profiles_count_the_same(variant: str, profile: str, exported, tmp
 def test_encoded_inputs_count_like_raw_observations(variant: str, exported, tmp_path: Path) -> None:
     agent, x, path = exported(variant)
     encoded = encode(agent.suite, agent.config, x, 0)
-    raw = count_nir(path, saved(tmp_path / "x.npz", observations=x))
-    assert count_nir(path, saved(tmp_path / "e.npz", inputs=encoded)) == raw
+    raw = counted(path, saved(tmp_path / "x.npz", observations=x))
+    assert counted(path, saved(tmp_path / "e.npz", inputs=encoded)) == raw
     if variant == "SwitchMT":  # inputs that do change are not counted once
         changing = encoded.copy()
         changing[1] = 0
-        seen = count_nir(path, saved(tmp_path / "c.npz", inputs=changing)).layers[0]
+        seen = counted(path, saved(tmp_path / "c.npz", inputs=changing)).layers[0]
         assert seen.effective_T == (raw.layers[0].effective_T[0], 0, *raw.layers[0].effective_T * 2)
 
 
@@ -203,7 +208,7 @@ def test_a_missing_event_threshold_is_not_guessed(exported, tmp_path: Path) -> N
     del stored.metadata["event_threshold"]
     write_nir(stored, path)
     with pytest.raises(ExportError, match="no event_threshold, expected it for events; export again"):
-        count_nir(path, saved(tmp_path / "x.npz", observations=x))
+        counted(path, saved(tmp_path / "x.npz", observations=x))
 
 
 # --- anybody's files
@@ -239,7 +244,7 @@ def test_a_foreign_graph_equals_a_dense_hand_count(binary: bool, tmp_path: Path)
     nir.write(tmp_path / "foreign.nir", written)
     rng = np.random.default_rng(4)
     inputs = rng.integers(0, 2 if binary else 4, (3, 35, 2, 6, 5)).astype(np.uint8)
-    seen = count_nir(tmp_path / "foreign.nir", saved(tmp_path / "x.npz", inputs=inputs, dt=1.0))
+    seen = counted(tmp_path / "foreign.nir", saved(tmp_path / "x.npz", inputs=inputs, dt=1.0))
     assert (seen.task, seen.decisions, seen.timesteps) == ("foreign", 35, 3)
     conv, fc = seen.layers
     kernel, weight = written.nodes["conv"].weight, written.nodes["fc"].weight
@@ -277,7 +282,7 @@ def test_a_recurrent_layer_shares_its_neurons(tmp_path: Path) -> None:
     edges = [("input", "fc"), ("fc", "fire"), ("fire", "back"), ("back", "fire"), ("fire", "half"), ("half", "head")]
     nir.write(tmp_path / "loop.nir", graph(shapes((2,), (1,), **between), [*edges, ("head", "output")], dt=1.0))
     inputs = np.array([[[1, 0]], [[0, 0]], [[0, 1]]], np.float32)
-    seen = count_nir(tmp_path / "loop.nir", saved(tmp_path / "x.npz", inputs=inputs))
+    seen = counted(tmp_path / "loop.nir", saved(tmp_path / "x.npz", inputs=inputs))
     by_name = {layer.name: layer for layer in seen.layers}
     # Neuron 1 fires at step 1 and is driven back by 1, which is no more than the threshold; neuron 2 fires at step 3.
     assert by_name["fc"].spikes_T == (1, 0, 1)
@@ -291,7 +296,7 @@ def test_a_recurrent_layer_shares_its_neurons(tmp_path: Path) -> None:
 
 def refused(path: Path, observations: Path, message: str) -> None:
     with pytest.raises(ExportError, match=message) as caught:
-        count_nir(path, observations)
+        counted(path, observations)
     assert "\n" not in str(caught.value)
 
 
