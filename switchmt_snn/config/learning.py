@@ -50,6 +50,9 @@ class LearningConfig:
     its updates. Evaluation is always eager. auto: native with engine native, else eager."""
     clip_rewards: bool = True
     """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward."""
+    return_normalization: Literal["none", "per_task"] = "none"
+    """per_task: divide the TD errors of each task by the size of its returns, so that tasks with large returns do not
+    outweigh the others. Q-values stay in the task's rewards; the loss is in these units (docs/algorithm.md, 32)."""
     life_loss_is_terminal: bool = False
     """Targets treat the loss of a life as terminal. The episode goes on, and returns and evaluation are as before.
     Refused if no task has lives."""

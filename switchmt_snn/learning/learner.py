@@ -117,6 +117,7 @@ class Learner(Stateful):
         "_decisions",
         "_invalid_KA",
         "_loss",
+        "_scale_K",
         "_step",
         "_trained",
     )
@@ -157,6 +158,7 @@ class Learner(Stateful):
         self._step = self.engine.executed(self._device_step, self.optimizer, self.generator)
         self.updates = 0
         self._invalid_KA = torch.as_tensor(~valid_actions_KA, device=device)
+        self._scale_K = torch.ones(len(valid_actions_KA), device=device)  # of TD errors
         self.loss_sum = torch.zeros((), device=device)
         self.q_sum = torch.zeros((), device=device)
         self.summed = 0
@@ -198,6 +200,10 @@ class Learner(Stateful):
         self.updates += 1
         self.summed += 1
 
+    def set_scale(self, task: int, scale: float) -> None:
+        """Divide a task's TD errors by this from now on; 1 until then. It is no part of the saved state."""
+        self._scale_K[task] = scale
+
     def _decay_learning_rate(self) -> None:
         decay_updates = self.config.learning_rate_decay_updates
         if decay_updates is not None:
@@ -212,7 +218,8 @@ class Learner(Stateful):
             q_choice_BA = values.choice_BA.masked_fill(self._invalid_KA[task], -torch.inf)
             targets = td_target(batch.rewards_B, batch.terminated_B, values.target, q_choice_BA, batch.discounts_B)
         predicted = of_actions(values.online, batch.actions_B)
-        loss = self._loss(predicted, targets)
+        scale = self._scale_K[task]
+        loss = self._loss(predicted / scale, targets / scale)
         for parameter in self._trained:
             parameter.grad = None
         loss.backward()

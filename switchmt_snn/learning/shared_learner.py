@@ -13,7 +13,7 @@ from switchmt_snn.config import LearningConfig
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import QNetwork
-from switchmt_snn.updates.processes import COPY_TARGET, LOAD, STOP, UPDATE, Divided, ProcessGroup
+from switchmt_snn.updates.processes import COPY_TARGET, LOAD, SCALE, STOP, UPDATE, Divided, ProcessGroup
 
 
 class SharedLearner(Learner):
@@ -56,6 +56,12 @@ class SharedLearner(Learner):
         self._group.announce(COPY_TARGET)
         super().copy_target()
 
+    def set_scale(self, task: int, scale: float) -> None:
+        """First process: as ``Learner.set_scale`` in all processes."""
+        super().set_scale(task, scale)
+        self._group.announce(SCALE, task)
+        self._group.share(scale)
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """First process: put a saved state back in all processes."""
         super().load_state_dict(state)
@@ -76,8 +82,10 @@ class SharedLearner(Learner):
                 super().copy_target()
             elif what == LOAD:
                 super().load_state_dict(self._group.share())
+            elif what == SCALE:
+                super().set_scale(task, self._group.share())
             else:
-                raise ValueError(f"announcement {what}, expected one of {(STOP, UPDATE, COPY_TARGET, LOAD)}")
+                raise ValueError(f"announcement {what}, expected one of {(STOP, UPDATE, COPY_TARGET, LOAD, SCALE)}")
         super().close()
 
     def close(self) -> None:

@@ -22,6 +22,7 @@ from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.measuring import layer_health, updates_to_settle
+from switchmt_snn.learning.return_scale import make_return_scales
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.statistics import reestimate_statistics
@@ -48,6 +49,7 @@ class Training(Stateful):
     SAVED = (
         "learner",
         "replays",
+        "return_scales",
         "policy",
         "task",
         "visit",
@@ -85,6 +87,7 @@ class Training(Stateful):
         seeds = np.random.SeedSequence(config.seed).spawn(4)
         self.learner = make_learner(config, suite, device, group)  # Q, Q*
         self.replays = [make_replay(config, suite, device) for _ in suite.names]  # D_1 ... D_|E|
+        self.return_scales = make_return_scales(config, num_tasks)
         self.policy = SwitchingPolicy(config.switching, num_tasks)
         self.task = 0
         self.visit = 0
@@ -166,6 +169,8 @@ class Training(Stateful):
         replay, terminal = self.replays[self.task], played.terminated
         if self.config.learning.life_loss_is_terminal and played.lives_lost is not None:
             terminal = terminal | played.lives_lost  # for targets; the episode goes on
+        if self.return_scales:
+            self.return_scales[self.task].add(played.rewards, terminal | played.truncated)
         for env in range(self.num_envs):
             replay.add(env, int(actions[env]), float(played.rewards[env]), bool(terminal[env]), played.frames[env])
         self.steps += self.num_envs
@@ -177,7 +182,11 @@ class Training(Stateful):
         """The updates that are due, from the current task's buffer or from every task's in turn."""
         learning = self.config.learning
         returns = Returns(learning.n_steps, learning.discount, learning.clip_rewards)
-        for _ in range(self.update_clock.advance(self.num_envs) * learning.updates_per_round):
+        updates = self.update_clock.advance(self.num_envs) * learning.updates_per_round
+        if updates > 0:
+            for task, scale in enumerate(self.return_scales):
+                self.learner.set_scale(task, scale.value)
+        for _ in range(updates):
             tasks = [self.task] if learning.update_tasks == "current" else range(len(self.replays))
             for task in tasks:
                 if not self.is_warming_up(task):
@@ -335,7 +344,7 @@ class Training(Stateful):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue a run; ``reproducible`` says whether its episodes repeated themselves from seed and actions."""
-        super().load_state_dict(state)
+        super().load_state_dict({"return_scales": [], **state})  # older states have none
         replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]
         self.reproducible = all(replayed)
 

@@ -30,7 +30,7 @@ from switchmt_snn.spiking.normalization import TaskBatchNorm
 from switchmt_snn.updates.passes import DifferentiatedPass, forward_passes
 from switchmt_snn.updates.protocol import Engine, Values
 
-STOP, UPDATE, COPY_TARGET, LOAD = range(4)
+STOP, UPDATE, COPY_TARGET, LOAD, SCALE = range(5)
 """What the first process announces."""
 
 

@@ -59,6 +59,7 @@ def outcome(learner: Learner) -> dict[str, torch.Tensor]:
     learner.update(first, 0)
     parts = {f"grad/{name}": p.grad.clone() for name, p in learner.network.named_parameters() if p.grad is not None}
     parts |= {f"first/{name}": value.clone() for name, value in learner.network.named_buffers() if "running" in name}
+    learner.set_scale(1, 2.5)
     learner.update(second, 1)
     learner.copy_target()
     learner.update(third, 1)
