@@ -46,6 +46,11 @@ class SwitchingConfig:
     """reward_plateau: a slope of fewer standard errors than this is not an improvement."""
     plateau_patience_episodes: int = 3
     """reward_plateau: leave after this many episode ends in a row without improvement (hysteresis)."""
+    judge_learning: Literal["auto", "always", "after_updates"] = "auto"
+    """When a policy that judges learning is asked. after_updates: only once the task's own replay has been learned from
+    in this visit; parameter_change also leaves out windows without an update. always: at every episode end (the paper's
+    listing, which takes a change of 0 while the replay fills for convergence). auto: after_updates, but always for runs
+    that began before this setting."""
     min_stay_episodes: int = 0
     """No policy leaves before this many episodes of the visit (the released script: 25)."""
     min_stay_steps: int = 0

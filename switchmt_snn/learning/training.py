@@ -56,6 +56,7 @@ class Training(Stateful):
         "steps",
         "steps_by_task",
         "steps_in_visit",
+        "updates_in_visit",
         "episodes_in_visit",
         "episodes_by_task",
         "starts_by_task",
@@ -94,6 +95,7 @@ class Training(Stateful):
         self.steps = 0
         self.steps_by_task = [0] * num_tasks
         self.steps_in_visit = 0
+        self.updates_in_visit = 0  # from the current task's replay
         self.episodes_in_visit = 0
         self.episodes_by_task = [0] * num_tasks  # episodes that ended
         self.starts_by_task = [0] * num_tasks  # episodes that began; numbers their seeds
@@ -192,6 +194,7 @@ class Training(Stateful):
                 if not self.is_warming_up(task):
                     batch = self.replays[task].sample(learning.batch_size, self.sample_rng, returns)
                     self.learner.update(batch, task)
+                    self.updates_in_visit += task == self.task
                     if learning.target_update_every_updates is not None:
                         self._copy_target(passed=1)
 
@@ -224,6 +227,7 @@ class Training(Stateful):
                     episodes_in_visit=self.episodes_in_visit,
                     steps_in_visit=self.steps_in_visit,
                     updates=self.learner.updates,
+                    updates_in_visit=self.updates_in_visit,
                     episode_return=episode_return,
                     parameters=self.learner.parameters,
                 )
@@ -246,6 +250,7 @@ class Training(Stateful):
         self.visit += 1
         self.task = task
         self.steps_in_visit = 0
+        self.updates_in_visit = 0
         self.episodes_in_visit = 0
         self._reestimate(task, self.learner.network, self.learner.target)
         self._begin_episodes()
@@ -344,7 +349,8 @@ class Training(Stateful):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue a run; ``reproducible`` says whether its episodes repeated themselves from seed and actions."""
-        super().load_state_dict({"return_scales": [], **state})  # older states have none
+        older = {"return_scales": [], "updates_in_visit": 0}  # what states of older versions lack, and do not use
+        super().load_state_dict({**older, **state})
         replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]
         self.reproducible = all(replayed)
 

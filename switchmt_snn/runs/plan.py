@@ -14,7 +14,7 @@ names the device.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -97,10 +97,10 @@ def decide(
     device: torch.device,
     processes: int = 1,
 ) -> tuple[ExperimentConfig, tuple[str, ...]]:
-    """Replace ``auto`` in precision, engine, acting and compression by what this machine can do.
+    """Replace ``auto`` in precision, engine, acting and compression by what this machine can do, and in judge_learning.
 
     A run that exists keeps what it began with, because precision and engine change roundings. Runs from before these
-    settings existed began with float32 and the eager engine.
+    settings existed began with float32, the eager engine, and policies that judged at every episode end.
 
     Args:
         config: resolved.
@@ -122,7 +122,8 @@ def decide(
     engine, engine_notes = _engine(config, stored, device, processes)
     config = _with(config, engine=engine, replay_compression=_compression(config, stored, suite))
     config = _with(config, acting=_acting(config, stored))
-    return config, (*notes, *engine_notes)
+    switching = replace(config.switching, judge_learning=_judge_learning(config, stored))
+    return replace(config, switching=switching), (*notes, *engine_notes)
 
 
 def _with(config: ExperimentConfig, **learning: str) -> ExperimentConfig:
@@ -184,6 +185,14 @@ def _acting(config: ExperimentConfig, stored: ExperimentConfig | None) -> str:
             f"{engine!r}; use learning.acting=eager or learning.engine={asked}"
         )
     return asked
+
+
+def _judge_learning(config: ExperimentConfig, stored: ExperimentConfig | None) -> Literal["always", "after_updates"]:
+    """Once there were updates; a run from before the setting existed goes on as it began."""
+    asked = config.switching.judge_learning
+    if asked == "auto" and stored is not None:
+        asked = "always" if stored.switching.judge_learning == "auto" else stored.switching.judge_learning
+    return "after_updates" if asked == "auto" else asked
 
 
 def _unavailable(engine: str, reason: str, begun: bool) -> ConfigError:

@@ -25,8 +25,8 @@ LIVE_EVERY_S = 0.5
 class Progress:
     """An observer that shows where a run stands; see ``switchmt_snn.runs.run.Observer``."""
 
-    def __init__(self, console: Console) -> None:
-        self.console = console
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console()
         self._live: Live | None = None
         self._epsilon = 1.0
         self._warming_up = False

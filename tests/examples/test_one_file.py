@@ -117,7 +117,7 @@ def test_switching_decisions_equal_the_one_file_decisions(seed: int) -> None:
         episodes += 1
         size = 0.05 * (1.1 + np.sin(episode / 9))
         theta = theta + size * torch.randn(50, generator=generator)
-        record = EpisodeRecord(task, episodes, episodes, episode, 0.0, theta.clone)
+        record = EpisodeRecord(task, episodes, episodes, episode, episode, 0.0, theta.clone)
         decision, leave = ours.end_of_episode(record), theirs.says_leave(theta)
         assert isinstance(decision, SwitchTo) == leave, f"episode {episode}"
         if leave:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,9 +35,11 @@ from tests.conftest import SameObservationEnvironment, small_config, vector_suit
 
 
 def record(
-    episode: int, steps: int, theta: Tensor, updates: int = 0, value: float = 0.0, task: int = 0
+    episode: int, steps: int, theta: Tensor, updates: int | None = None, value: float = 0.0, task: int = 0
 ) -> EpisodeRecord:
-    return EpisodeRecord(task, episode, steps, updates, value, lambda: theta.clone())
+    """A record of a visit that began at update 0; default: one update per episode."""
+    updates = episode if updates is None else updates
+    return EpisodeRecord(task, episode, steps, updates, updates, value, lambda: theta.clone())
 
 
 def play(policy: SwitchingPolicy, lengths: list[int], drift: float, values: list[float]) -> list[tuple[int, int, bool]]:
@@ -124,6 +127,47 @@ def test_eq_3_spans_k_episodes() -> None:
     assert "parameter_change" not in fifth.measured, "H_i was emptied"
 
 
+LEARNING_POLICIES = ("parameter_change", "parameter_change_per_update", "reward_plateau", "parameter_and_reward")
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_a_policy_that_judges_learning_waits_for_the_first_update_of_the_visit(policy: str) -> None:
+    """Parameters that no update moved, and the returns of random play, are no sign of convergence."""
+    config = SwitchingConfig(policy=policy, window_episodes=2, plateau_window_episodes=3, visit_episodes=4)
+    still = [record(n, 9_000 * n, torch.ones(4), updates=0) for n in range(1, 20)]
+    learning = policy in LEARNING_POLICIES
+    for judge, waits in (("after_updates", learning), ("auto", learning), ("always", False)):
+        asked = SwitchingPolicy(replace(config, judge_learning=judge), 2)  # type: ignore[arg-type]
+        answers = [asked.end_of_episode(each) for each in still]
+        if waits:
+            assert {answer.reason for answer in answers} == {"no_updates_yet"}
+            assert all(isinstance(answer, Stay) for answer in answers)
+        elif policy != "parameter_change_per_update":  # it never judged a window without updates
+            assert any(isinstance(answer, SwitchTo) for answer in answers)
+    bounded = SwitchingPolicy(replace(config, max_stay_steps=10_000), 2)
+    assert isinstance(bounded.end_of_episode(still[1]), SwitchTo), "the bounds hold while it waits"
+
+
+def test_the_window_of_eq_3_begins_with_the_first_update_and_decides_nothing_without_one() -> None:
+    policy = SwitchingPolicy(SwitchingConfig(policy="parameter_change", window_episodes=2), 2)
+    updates = [0, 0, 0, 5, 5, 5, 6]
+    thetas = [torch.full((4,), 1.0 + count / 100) for count in updates]
+    answers = [policy.end_of_episode(record(n, n, theta, updates[n])) for n, theta in enumerate(thetas)]
+    assert [answer.reason for answer in answers] == [
+        *["no_updates_yet"] * 3, "window_fills", "window_fills", "no_updates_in_window", "parameter_change",
+    ]  # fmt: skip
+    assert answers[5].measured["parameter_change"] == 0.0
+    assert answers[6].measured["parameter_change"] == pytest.approx(0.01 / 1.05)
+    assert [isinstance(answer, SwitchTo) for answer in answers] == [False] * 6 + [True]
+
+
+def test_a_state_from_before_updates_were_kept_goes_on() -> None:
+    config = SwitchingConfig(policy="parameter_change", window_episodes=1, judge_learning="always")
+    policy = SwitchingPolicy(config, 2)
+    policy.load_state_dict({"criterion": {"history": [torch.ones(4)]}})
+    assert isinstance(policy.end_of_episode(record(2, 2, torch.ones(4), updates=0)), SwitchTo)
+
+
 def test_snapshots_are_copies() -> None:
     """The released script's snapshot aliases the live parameters, so its change is always 0. One update must show."""
     from switchmt_snn.learning.training import Training
@@ -186,7 +230,7 @@ def test_every_criterion_reports_its_columns_and_keeps_no_more_snapshots_than_it
 
     for episode in range(1, 20):
         updates = 0 if episode < 5 else 10 * episode
-        decision = policy.end_of_episode(EpisodeRecord(0, 1, 1, updates, float(episode), parameters))
+        decision = policy.end_of_episode(EpisodeRecord(0, 1, 1, updates, 1, float(episode), parameters))
         seen |= set(decision.measured)
     assert seen == set(policy.columns)
     assert most <= policy.criterion.snapshots(config)

@@ -105,6 +105,23 @@ def test_steps_episodes_and_updates_add_up() -> None:
     assert due - 2 * -(-21 // 3) <= training.learner.updates < due
 
 
+@pytest.mark.parametrize("update_tasks", ["current", "all"])
+def test_no_task_is_left_by_a_judgement_on_learning_before_its_own_first_update(update_tasks: str) -> None:
+    """Episodes of 7 steps, a replay that is sampled from 40 transitions on, windows of 2 episodes."""
+    config = small_config(
+        total_steps=300,
+        learning={"learning_starts_steps": 40, "update_tasks": update_tasks, "learning_rate": 1e-9},
+        switching={"max_stay_steps": None},
+    )
+    switches = [e for e in run(counting(config)) if isinstance(e, SwitchDecided)]
+    for task in range(2):
+        first = [e for e in switches if e.visit == task + 1]
+        waiting = [e.decision.reason for e in first if e.episodes_in_visit * 7 <= 39]
+        assert waiting == ["no_updates_yet"] * 5
+        assert [e.decision.reason for e in first[5:]] == ["window_fills"] * 2 + ["parameter_change"]
+        assert isinstance(first[-1].decision, SwitchTo)
+
+
 @pytest.mark.slow
 def test_a_task_that_is_left_pauses_and_goes_on() -> None:
     """Visits of 4 steps, episodes of 7: each one ends in a later visit than it began in, and none is lost."""

@@ -46,8 +46,8 @@ class SwitchingPolicy(Stateful):
     Example:
         >>> import torch
         >>> policy = SwitchingPolicy(SwitchingConfig(policy="fixed_episodes", visit_episodes=1), num_tasks=2)
-        >>> seen = {"task": 0, "episodes_in_visit": 1, "steps_in_visit": 9, "updates": 0, "episode_return": 1.0}
-        >>> record = EpisodeRecord(**seen, parameters=lambda: torch.ones(3))
+        >>> seen = {"task": 0, "episodes_in_visit": 1, "steps_in_visit": 9, "updates": 0, "updates_in_visit": 0}
+        >>> record = EpisodeRecord(**seen, episode_return=1.0, parameters=lambda: torch.ones(3))
         >>> policy.end_of_episode(record).task
         1
     """
@@ -77,6 +77,10 @@ class SwitchingPolicy(Stateful):
             ConfigError: the criterion reports a number that it does not declare in ``columns``, or asks for parameters
                 although it declares no ``snapshots``; one from outside the package fails, or returns no ``Verdict``.
         """
+        if self._must_wait(record):
+            if self.must_leave(record.steps_in_visit):
+                return self.leave(record.task)
+            return Stay("no_updates_yet", {}, "no update yet")
         if self.criterion.snapshots(self.config) == 0:
             record = replace(record, parameters=self._undeclared_snapshot)
         with criterion_code(self.config.policy, "end_of_episode"):
@@ -95,6 +99,11 @@ class SwitchingPolicy(Stateful):
         if too_soon:
             return Stay("min_stay", measured, verdict.summary)
         return self._next(record.task, verdict.reason, measured)
+
+    def _must_wait(self, record: EpisodeRecord) -> bool:
+        """Whether there is nothing to judge yet: the visit has had no update from the task's own replay."""
+        judges = self.criterion.judges_learning and self.config.judge_learning != "always"
+        return judges and record.updates_in_visit == 0
 
     def must_leave(self, steps_in_visit: int) -> bool:
         """Whether the visit has lasted ``max_stay_steps``; asked at every step, also within an episode."""

@@ -29,7 +29,7 @@ def check_policy(config: SwitchingConfig) -> None:
     for task in range(2):
         for episode in range(1, EPISODES + 1):
             theta = torch.full((4,), 1.0 / (task * EPISODES + episode))
-            record = EpisodeRecord(task, episode, 10 * episode, episode, float(episode % 4), theta.clone)
+            record = EpisodeRecord(task, episode, 10 * episode, episode, episode, float(episode % 4), theta.clone)
             policy.end_of_episode(record)
             policy.state_dict()
         policy.leave(task)

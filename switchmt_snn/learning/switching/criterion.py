@@ -41,6 +41,7 @@ class EpisodeRecord:
         episodes_in_visit: episodes that ended since the task was entered, this one included.
         steps_in_visit: agent steps since the task was entered.
         updates: gradient steps of the whole run.
+        updates_in_visit: gradient steps from the task's own replay since the task was entered.
         episode_return: raw return of the episode.
         parameters: returns theta_t as a vector, a copy that stays as it is. Only a criterion that declares
             ``Criterion.snapshots`` may call it.
@@ -50,6 +51,7 @@ class EpisodeRecord:
     episodes_in_visit: int
     steps_in_visit: int
     updates: int
+    updates_in_visit: int
     episode_return: float
     parameters: Callable[[], Tensor]
 
@@ -80,9 +82,12 @@ class Criterion(Stateful):
 
     Attributes:
         columns: names of the numbers that it reports in ``Verdict.measured``; they are columns of switches.csv.
+        judges_learning: whether it concludes from what was learned. Then it sees no episode of a visit that ended
+            before the visit's first update (``switching.judge_learning``). False for a rule that only counts.
     """
 
     columns: ClassVar[tuple[str, ...]]
+    judges_learning: ClassVar[bool] = True
 
     def __init__(self, config: SwitchingConfig) -> None:
         """Take what it needs of the settings in section ``switching``."""

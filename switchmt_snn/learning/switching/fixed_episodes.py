@@ -11,6 +11,7 @@ class FixedEpisodes(Criterion):
     """Leave after a number of episodes (MTSpark and the baselines: 25)."""
 
     columns = ("visit_episodes",)
+    judges_learning = False
     DERIVED = ("episodes",)
 
     def __init__(self, config: SwitchingConfig) -> None:

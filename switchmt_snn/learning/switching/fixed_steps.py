@@ -11,6 +11,7 @@ class FixedSteps(Criterion):
     """Leave at the first episode end after a number of steps."""
 
     columns = ("visit_steps",)
+    judges_learning = False
     DERIVED = ("steps",)
 
     def __init__(self, config: SwitchingConfig) -> None:

@@ -10,6 +10,7 @@ class Interleave(Criterion):
     """Leave after every episode: the tasks take turns."""
 
     columns = ()
+    judges_learning = False
 
     def end_of_episode(self, record: EpisodeRecord) -> Verdict:
         """Leave, whatever happened."""

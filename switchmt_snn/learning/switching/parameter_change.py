@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -14,17 +16,19 @@ class ParameterChange(Criterion):
     """Eq. 3: leave when ``||theta_t - theta_(t-K)||_2 / ||theta_(t-K)||_2`` falls below the threshold (10 %).
 
     H holds K + 1 snapshots, so that the change spans K episodes as Eq. 3 says (the listing's K snapshots span K - 1;
-    docs/algorithm.md, deviation 2).
+    docs/algorithm.md, deviation 2). A window in which no update was made says nothing about learning, so it decides
+    nothing, unless ``switching.judge_learning`` is ``always``.
     """
 
     columns = ("parameter_change", "change_threshold", "snapshots")
-    SAVED = ("history",)
-    DERIVED = ("window_episodes", "threshold")
+    SAVED = ("history", "updates")
+    DERIVED = ("window_episodes", "threshold", "always")
 
     def __init__(self, config: SwitchingConfig) -> None:
         self.window_episodes = config.window_episodes
         self.threshold = config.change_threshold
-        self.history: list[Tensor] = []
+        self.always = config.judge_learning == "always"
+        self.start_visit()
 
     @classmethod
     def snapshots(cls, config: SwitchingConfig) -> int:
@@ -33,19 +37,28 @@ class ParameterChange(Criterion):
 
     def start_visit(self) -> None:
         """H_i <- []."""
-        self.history = []
+        self.history: list[Tensor] = []
+        self.updates: list[int] = []
 
     def end_of_episode(self, record: EpisodeRecord) -> Verdict:
         """Append theta_t to H_i; measure the relative change over K episodes."""
         self.history.append(record.parameters())
+        self.updates.append(record.updates)
         measured = {"change_threshold": self.threshold, "snapshots": float(len(self.history))}
         if len(self.history) <= self.window_episodes:
             return Verdict(False, "window_fills", measured)
-        del self.history[: len(self.history) - self.window_episodes - 1]
+        for values in (self.history, self.updates):
+            del values[: len(values) - self.window_episodes - 1]
         change = relative_change(self.history[0], self.history[-1])
         measured |= {"parameter_change": change, "snapshots": float(len(self.history))}
+        if self.updates[0] == self.updates[-1] and not self.always:
+            return Verdict(False, "no_updates_in_window", measured)
         summary = f"change {change:.1%} of {self.threshold:.1%}"
         return Verdict(change < self.threshold, "parameter_change", measured, summary)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put a saved state back; states of runs that began before updates were kept have none, nor use any."""
+        super().load_state_dict({"updates": [0] * len(state["history"]), **state})
 
 
 def relative_change(before: Tensor, after: Tensor) -> float:
