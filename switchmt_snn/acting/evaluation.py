@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.config import EvaluationConfig, TasksConfig
+from switchmt_snn.config.numbers import exact
 from switchmt_snn.machine.cores import all_cores
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import suite_of
@@ -83,8 +84,8 @@ class EvaluationProtocol:
         return cls(**own, environment=suite_of(TasksConfig(**settings)).protocol)
 
     def __str__(self) -> str:
-        parts = [f"{self.episodes} episodes per task", f"epsilon {self.epsilon:g}", self.score, f"seed {self.seed}"]
-        return ", ".join([*parts, *self.environment])
+        played = (f"{self.episodes} episodes per task", f"epsilon {exact(self.epsilon)}")
+        return ", ".join([*played, self.score, f"seed {self.seed}", *self.environment])
 
 
 @dataclass(frozen=True)

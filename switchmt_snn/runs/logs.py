@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
+from switchmt_snn.config.numbers import exact
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDecided
 from switchmt_snn.learning.switching import DECISION_COLUMNS, SwitchTo
@@ -18,7 +19,11 @@ EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncat
 
 
 class RunLogs:
-    """An observer that writes events down. Rows follow the header of their file, also that of an older version."""
+    """An observer that writes events down.
+
+    Numbers are written so that they read back as the same ones. Rows follow the header of their file, also that of an
+    older version.
+    """
 
     def __init__(
         self, folder: Path, task_names: tuple[str, ...], measured: tuple[str, ...], sizes: dict[str, int] | None
@@ -64,10 +69,10 @@ class RunLogs:
             "step": event.step,
             "task": self._tasks[event.task],
             "episode": event.episode,
-            "return": f"{event.episode_return:g}",
+            "return": exact(event.episode_return),
             "length_steps": event.length_steps,
             "truncated": int(event.truncated),
-            "epsilon": f"{event.epsilon:.6g}",
+            "epsilon": exact(event.epsilon),
             "updates": event.updates,
         }
 
@@ -83,7 +88,7 @@ class RunLogs:
             "decision": "switch" if switches else "stay",
             "next_task": self._tasks[decision.task] if isinstance(decision, SwitchTo) else "",
             "reason": decision.reason,
-            **{name: f"{value:.9g}" for name, value in decision.measured.items()},
+            **{name: exact(value) for name, value in decision.measured.items()},
         }
 
     def _metrics_row(self, event: Measured) -> dict[str, Any]:
