@@ -26,6 +26,7 @@ from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, read_nir
+from switchmt_snn.runs.evaluations import evaluation_name
 from switchmt_snn.runs.files import file_name, json_text, write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
@@ -243,7 +244,7 @@ def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
 def evaluate_exported(
     runtime: str, run: str | Path | None = None, task: str | None = None, checkpoint: str = "last", **protocol: Any
 ) -> tuple[Evaluation, float]:
-    """Evaluate a run's exported files instead of its network; also written to ``export/evaluation_<runtime>.json``.
+    """Evaluate a run's exported files instead of its network; also written to ``export/evaluations/``.
 
     Args:
         runtime: ``onnx`` (``export/decision.onnx``) or ``nir`` (``export/<task>.nir`` in the reference interpreter).
@@ -274,7 +275,9 @@ def evaluate_exported(
     decisions, equal = (sum(column) for column in zip(*compared.compared, strict=True))
     share = equal / decisions
     facts = {"runtime": runtime, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
-    write_atomically(folder.path / "export" / f"evaluation_{runtime}.json", json_text(facts, indent=1).encode())
+    path = folder.path / "export" / "evaluations" / f"{runtime}_{evaluation_name(evaluation)}.json"
+    path.parent.mkdir(exist_ok=True)
+    write_atomically(path, json_text(facts, indent=1).encode())
     return evaluation, share
 
 

@@ -105,7 +105,7 @@ def profile(
     for index, (recording, counted) in enumerate(zip(recordings, profiles, strict=True)):
         sample = take_sample(agent, index, recording)
         frames.append(sample.frames)
-        evaluation = _evaluated(run_folder.path, agent.step, recording.task)
+        evaluation = run_folder.evaluations.best_known(agent.step, recording.task)
         tasks.append(
             _task_facts(counted, selection.targets, evaluation, decisions_per_s)
             | {
@@ -225,7 +225,7 @@ def _written(
 def _task_facts(
     task: TaskCounts,
     targets: tuple[Target, ...],
-    evaluation: dict[str, float] | None,
+    evaluation: dict[str, Any] | None,
     decisions_per_s: float | None,
 ) -> dict[str, Any]:
     energies = []
@@ -252,26 +252,6 @@ def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> T
         for piece, _ in play_in_pieces(agent, recording.task, decisions, recording.epsilon, recording.seed):
             counter.add(piece.reshape(-1, *agent.suite.observation_shape))
     return counter.counts()
-
-
-def _evaluated(run: Path, step: int, task: str) -> dict[str, float] | None:
-    """The agent's and the random policy's scores in the newest evaluation at this training step; None without one."""
-    found = sorted((run / "evaluations").glob(f"step-{step:012d}_*.json"), key=lambda path: path.stat().st_mtime)
-    for path in reversed(found):
-        try:
-            rows = {row["policy"]: row for row in json.loads(path.read_bytes())["tasks"] if row["task"] == task}
-            if "agent" in rows:
-                return {
-                    "episodes": rows["agent"]["episodes"],
-                    "score": rows["agent"]["mean"],
-                    "random_score": rows["random"]["mean"],
-                    "decisions_per_episode": rows["agent"]["mean_length_steps"],
-                }
-        except (ValueError, KeyError, TypeError) as error:
-            raise ExportError(
-                f"{path} cannot be read ({error!s:.80}), expected an evaluation; delete it, or evaluate again"
-            ) from error
-    return None
 
 
 def _gains(agent: Agent, task: int) -> dict[str, dict[str, float]]:

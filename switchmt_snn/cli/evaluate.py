@@ -60,7 +60,7 @@ def command(argv: list[str]) -> int:
     Console().print(evaluation_table(evaluation))
     if facts:
         print(f"played by {options.runtime}; {share:.2%} of its decisions are those of the trained network")
-        print(path / "export" / f"evaluation_{options.runtime}.json")
+        print(path / "export" / "evaluations")
     else:
         print(path / "evaluations")
     return 0

@@ -6,20 +6,19 @@ config.yaml  environment.json  code_changes.jsonl  metrics.jsonl  episodes.csv  
 from __future__ import annotations
 
 import csv
-import io
 import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import filelock
 
 from switchmt_snn.acting.evaluation import Evaluation
-from switchmt_snn.config import EvaluationConfig, ExperimentConfig, differences, load_config, to_yaml
+from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.checkpoint import CheckpointStore
-from switchmt_snn.runs.files import file_name, json_text, write_atomically
+from switchmt_snn.runs.evaluations import Evaluations
+from switchmt_snn.runs.files import write_atomically
 
 RUNS = Path("runs")
 
@@ -91,6 +90,11 @@ class RunFolder:
         """The run's checkpoints."""
         return CheckpointStore(self.path / "checkpoints", keep)
 
+    @property
+    def evaluations(self) -> Evaluations:
+        """The run's evaluations."""
+        return Evaluations(self.path / "evaluations")
+
     def create(self, config: ExperimentConfig, environment: dict[str, Any]) -> None:
         """Make the folder of a new run.
 
@@ -160,35 +164,10 @@ class RunFolder:
 
     def save_evaluation(self, evaluation: Evaluation) -> Path:
         """Write a summary (JSON) and the episodes (CSV) of an evaluation; returns the CSV's path."""
-        folder = self.path / "evaluations"
-        protocol = evaluation.protocol
-        tasks = file_name(*sorted({row.task for row in evaluation.tasks}))
-        stem = f"{_evaluation_stem(evaluation.step)}_{tasks}_n{protocol.episodes}_seed{protocol.seed}"
-        rows = [asdict(episode) for episode in evaluation.episodes]
-        text = io.StringIO()
-        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
         try:
-            folder.mkdir(exist_ok=True)
-            write_atomically(folder / f"{stem}.csv", text.getvalue().encode())
-            write_atomically(folder / f"{stem}.json", json_text(evaluation.to_dict(), indent=1).encode())
+            return self.evaluations.save(evaluation)
         except OSError as error:
-            raise RunFolderError(_unwritable(folder, error)) from error
-        return folder / f"{stem}.csv"
-
-    def has_evaluation(self, step: int) -> bool:
-        """Whether the weights of this step were evaluated."""
-        return any((self.path / "evaluations").glob(f"{_evaluation_stem(step)}_*.json"))
-
-    def mean_returns(self, step: int, settings: EvaluationConfig) -> dict[str, float]:
-        """Mean return of the agent by task, from an evaluation of this step's weights; empty if it was not made."""
-        name = f"{_evaluation_stem(step)}_*_n{settings.episodes}_seed{settings.seed}.json"
-        means: dict[str, float] = {}
-        for path in sorted((self.path / "evaluations").glob(name)):
-            rows = json.loads(path.read_text())["tasks"]
-            means |= {row["task"]: float(row["mean"]) for row in rows if row["policy"] == "agent"}
-        return means
+            raise RunFolderError(_unwritable(self.evaluations.folder, error)) from error
 
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""
@@ -197,10 +176,6 @@ class RunFolder:
             for row in csv.DictReader(stream):
                 by_task.setdefault(row["task"], []).append(float(row["return"]))
         return {task: (values[:episodes], values[-episodes:]) for task, values in by_task.items()}
-
-
-def _evaluation_stem(step: int) -> str:
-    return f"step-{step:012d}"
 
 
 def _unwritable(path: Path, error: OSError) -> str:

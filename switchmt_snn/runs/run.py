@@ -191,12 +191,9 @@ class _Driver:
         training, config = self.training, self.config
         log_sizes, resumed_at, notes = self._restore()
         if resumed_at is not None:
-            self.solved = self._is_solved(self.folder.mean_returns(resumed_at, config.evaluation))
-        if self.solved:
-            evaluated = bool(self.folder.mean_returns(training.steps, self._final_evaluation()))
-        else:
-            evaluated = training.steps >= config.total_steps and self.folder.has_evaluation(training.steps)
-        if evaluated:
+            self.solved = self._is_solved(self.folder.evaluations.mean_returns(resumed_at, config.evaluation))
+        at_its_end = self.solved or training.steps >= config.total_steps
+        if at_its_end and self.folder.evaluations.mean_returns(training.steps, self._final_evaluation()):
             return RunResult(self.folder.path, "already_finished", training.steps, None)
         try:
             return self._run(log_sizes, resumed_at, [*self.notes, *notes])

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from switchmt_snn.config import METHOD_TRAITS
-from switchmt_snn.errors import ExportError
+from switchmt_snn.errors import ExportError, RunFolderError
 from switchmt_snn.export import profile, provenance
 from switchmt_snn.export.chips.precision import at_precision, effect_of_precision
 from switchmt_snn.export.counts.network import count_task
@@ -188,7 +188,7 @@ def test_energy_per_episode_needs_an_evaluation_at_this_step(trained_run: Path) 
     assert task["energy"][0]["power_uw"] is None, "MinAtar has no frames per second"
     for path in (trained_run / "evaluations").glob("*.json"):
         path.write_text("{}")
-    with pytest.raises(ExportError, match="expected an evaluation; delete it"):
+    with pytest.raises(RunFolderError, match="expected an evaluation; delete it"):
         profile(trained_run, decisions=20)
     shutil.rmtree(trained_run / "evaluations")
     task = profile(trained_run, decisions=20).facts["tasks"][0]

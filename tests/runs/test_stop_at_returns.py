@@ -58,7 +58,7 @@ def test_training_goes_on_while_one_goal_is_missed(tmp_path: Path) -> None:
 def test_a_solved_run_that_was_cut_off_before_its_last_evaluation_makes_it(tmp_path: Path) -> None:
     config = cartpole_and_car([5.0, -200.0])
     first = train(config, tmp_path / "run")
-    for path in (tmp_path / "run" / "evaluations").glob("*_seed10001.*"):
+    for path in (tmp_path / "run" / "evaluations").glob("*_seed10001_*"):
         path.unlink()
     again = train(config, tmp_path / "run")
     assert (again.status, again.step) == ("finished", 100)

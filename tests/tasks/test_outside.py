@@ -75,7 +75,8 @@ def test_own_environments_are_evaluated_and_exported_under_names_that_differ(env
     assert {row["task"] for row in scores["tasks"]} == set(ENVS)
     assert scores["protocol"]["environment"] == []
     command(environments, "evaluate", "run", "--episodes", "3", "--task", ENVS[1])
-    assert (run / "evaluations" / f"step-000000000500_{file_name(ENVS[1])}_n3_seed10000.json").is_file()
+    name = f"step-000000000500_{file_name(ENVS[1])}_n3_seed10000_epsilon0.05_envs3.json"
+    assert (run / "evaluations" / name).is_file()
     command(environments, "export", "run", "--onnx", "--nir", "--task", ENVS[0], "--parity-decisions", "40")
     written = {path.name for path in (run / "export").iterdir()}
     assert written == {"decision.onnx", "step.onnx", f"decision_{file_name(ENVS[0])}.onnx", "parity.json"} | {

@@ -1,0 +1,105 @@
+"""The evaluations of a run: an evaluation's files are named by all that its scores depend on, so none replaces another.
+
+evaluations/step-000000012000_breakout+pong_n30_seed10000_epsilon0.05_envs8.json  (and .csv)
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol
+from switchmt_snn.config import EvaluationConfig
+from switchmt_snn.config.numbers import exact
+from switchmt_snn.errors import RunFolderError
+from switchmt_snn.runs.files import file_name, json_text, write_atomically
+
+
+def evaluation_name(evaluation: Evaluation) -> str:
+    """The name of an evaluation's files: step, tasks and protocol."""
+    protocol = evaluation.protocol
+    tasks = file_name(*sorted({row.task for row in evaluation.tasks}))
+    played = f"n{protocol.episodes}_seed{protocol.seed}_epsilon{exact(protocol.epsilon)}_envs{protocol.num_envs}"
+    return f"{_step_name(evaluation.step)}_{tasks}_{played}"
+
+
+class Evaluations:
+    """The stored evaluations of a run folder, those of older versions (shorter names) included."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def save(self, evaluation: Evaluation) -> Path:
+        """Write a summary (JSON) and the episodes (CSV); returns the CSV's path.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        rows = [asdict(episode) for episode in evaluation.episodes]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        self.folder.mkdir(exist_ok=True)
+        path = self.folder / f"{evaluation_name(evaluation)}.csv"
+        write_atomically(path, text.getvalue().encode())
+        write_atomically(path.with_suffix(".json"), json_text(evaluation.to_dict(), indent=1).encode())
+        return path
+
+    def mean_returns(self, step: int, settings: EvaluationConfig) -> dict[str, float]:
+        """Mean return of the agent by task, from evaluations of this step's weights with these episodes and epsilon."""
+        means: dict[str, float] = {}
+        asked = (settings.episodes, settings.seed, settings.epsilon)
+        for stored in self._at(step):
+            if tuple(stored["protocol"][key] for key in ("episodes", "seed", "epsilon")) == asked:
+                means |= {row["task"]: row["mean"] for row in stored["tasks"] if row["policy"] == "agent"}
+        return means
+
+    def best_known(self, step: int, task: str) -> dict[str, Any] | None:
+        """What this step's weights are worth in a task: the evaluation with the most episodes; of equals the last name.
+
+        Returns:
+            ``episodes``, ``score``, ``random_score``, ``decisions_per_episode`` and ``protocol`` (in words), or None.
+
+        Raises:
+            RunFolderError: a file is no evaluation.
+        """
+        found: dict[str, Any] | None = None
+        for stored in self._at(step):
+            rows = {row["policy"]: row for row in stored["tasks"] if row["task"] == task}
+            if "agent" in rows and (found is None or rows["agent"]["episodes"] >= found["episodes"]):
+                found = {
+                    "episodes": rows["agent"]["episodes"],
+                    "score": rows["agent"]["mean"],
+                    "random_score": rows["random"]["mean"],
+                    "decisions_per_episode": rows["agent"]["mean_length_steps"],
+                    "protocol": str(EvaluationProtocol.from_dict(stored["protocol"])),
+                }
+        return found
+
+    def _at(self, step: int) -> list[dict[str, Any]]:
+        """The stored summaries of a step, in order of their names."""
+        return [_read(path) for path in sorted(self.folder.glob(f"{_step_name(step)}_*.json"))]
+
+
+def _step_name(step: int) -> str:
+    return f"step-{step:012d}"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        stored = dict(json.loads(path.read_bytes()))
+        stored = {"protocol": dict(stored["protocol"]), "tasks": [dict(row) for row in stored["tasks"]]}
+        for row in stored["tasks"]:
+            row["mean"] = math.nan if row["mean"] is None else float(row["mean"])  # JSON has no NaN
+            _ = row["policy"], row["task"], row["episodes"], float(row["mean_length_steps"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunFolderError(
+            f"{path} cannot be read ({error!s:.80}), expected an evaluation; delete it, or evaluate again"
+        ) from error
+    return stored
