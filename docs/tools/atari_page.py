@@ -32,7 +32,7 @@ def atari_page() -> str:
 
 
 def _run(folder: Path) -> list[str]:
-    config = load_config(folder / "config.yaml")
+    config = load_config(folder / "config.yaml", reopen=False)
     games = config.tasks.names
     last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
     environment = json.loads((folder / "environment.json").read_text())

@@ -38,7 +38,7 @@ def cartpole_page() -> str:
 
 def _preset(times: list[dict[str, str]], preset: str) -> list[str]:
     runs = [FOLDER / f"{preset}-s{row['seed']}" for row in times]
-    config, finals = load_config(runs[0] / "config.yaml"), [_final(run) for run in runs]
+    config, finals = load_config(runs[0] / "config.yaml", reopen=False), [_final(run) for run in runs]
     protocol = EvaluationProtocol.from_dict(finals[0]["protocol"])
     goals = dict(zip(config.tasks.names, config.evaluation.stop_at_returns, strict=True))
     shown = ", ".join(f"{name} {goal:g}" for name, goal in goals.items())

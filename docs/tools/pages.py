@@ -172,7 +172,7 @@ def minatar_page() -> str:
     runs = sorted(folder.glob("switchmt-seed*"))
     environment = json.loads((runs[0] / "environment.json").read_text())
     facts = {run.name: json.loads((run / "environment.json").read_text()) for run in sorted(folder.glob("*-seed*"))}
-    config = load_config(runs[0] / "config.yaml")
+    config = load_config(runs[0] / "config.yaml", reopen=False)
     games, total = config.tasks.names, config.total_steps
     evaluation = json.loads(max(runs[0].glob("evaluations/*.json")).read_text())
     protocol = EvaluationProtocol.from_dict(evaluation["protocol"])
@@ -249,7 +249,7 @@ def export_page() -> str:
     ]
     for run in runs:
         parity = json.loads((run / "parity.json").read_text())
-        config = load_config(run / "config.yaml")
+        config = load_config(run / "config.yaml", reopen=False)
         exact, simulators = parity["dyadic"], parity["simulators"]
         bitwise = sum(row["bitwise"] for row in exact)
         names = ", ".join(dict.fromkeys(row["simulator"] for row in simulators))

@@ -98,7 +98,7 @@ def _changes(name: str) -> list[str]:
     base = BASES[name]
     if base is None:
         return ["", ""]
-    old, new = (load_config(FOLDER / run / "config.yaml") for run in (base, name))
+    old, new = (load_config(FOLDER / run / "config.yaml", reopen=False) for run in (base, name))
     changed = [
         f"`{key}: {json.dumps(value)}`"
         for key, (_, value) in differences(old, new).items()

@@ -35,7 +35,7 @@ def command(argv: list[str]) -> int:
     options = parse(TrainOptions, rest, "train", TrainOptions(experiment=default))
     config = resolve(options.experiment)
     if options.print_config:
-        print(to_yaml(config), end="")
+        print(to_yaml(config, options.experiment), end="")
         return 0
     from switchmt_snn.runs.run import Observer, train
     from switchmt_snn.viewing.progress import Progress
@@ -46,7 +46,7 @@ def command(argv: list[str]) -> int:
     observers: list[Observer] = [Progress(console)]
     if config.recording.tensorboard:
         observers.append(TensorBoard())
-    result = train(config, options.run, observers)
+    result = train(options.experiment, options.run, observers)
     if result.status == "served":
         return 0
     if options.json:
@@ -97,7 +97,6 @@ def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:
     if source is None and run is not None:
         from switchmt_snn.runs.folder import RunFolder
 
-        folder = RunFolder(Path(run))
-        if folder.is_run:
-            return folder.config()
+        if RunFolder(Path(run)).is_run:
+            return load_config(Path(run) / "config.yaml")
     return load_config(source or "quickstart")

@@ -11,16 +11,21 @@ from typing import Any
 import yaml
 
 from switchmt_snn.config.checks import field_types
+from switchmt_snn.config.decided import KEY, closed, opened, presumably_open, record
 from switchmt_snn.config.experiment import ExperimentConfig
 from switchmt_snn.errors import ConfigError, did_you_mean
 
 
-def load_config(source: str | Path, absent: dict[str, dict[str, Any]] | None = None) -> ExperimentConfig:
+def load_config(
+    source: str | Path, absent: dict[str, dict[str, Any]] | None = None, reopen: bool = True
+) -> ExperimentConfig:
     """Read a config from a YAML file, or a preset by name (``quickstart``, ``paper``, ``configs/paper.yaml``).
 
     Args:
         source: file or preset.
         absent: what settings by section are, if the file does not name them; None means the defaults.
+        reopen: a file that a run or ``--print-config`` wrote says which values were decided from ``auto`` or null. True
+            leaves them open again, so that a variation decides them anew; False takes them as they were decided.
 
     Raises:
         ConfigError: no such file or preset, not YAML, or a key or value that the config does not take.
@@ -40,10 +45,15 @@ def load_config(source: str | Path, absent: dict[str, dict[str, Any]] | None = N
         ) from error
     if data is None:
         data = {}
+    if not isinstance(data, dict):
+        return from_dict(data, where=str(source))
+    settings = opened(data, str(source)) if reopen else closed(data)
     for section, values in (absent or {}).items():
-        if isinstance(data, dict) and isinstance(data.get(section, {}), dict):
-            data[section] = values | data.get(section, {})
-    return from_dict(data, where=str(source))
+        if isinstance(settings.get(section, {}), dict):
+            settings[section] = values | settings.get(section, {})
+    config = from_dict(settings, where=str(source))
+    is_older_run = path.name == "config.yaml" and path.with_name("environment.json").is_file() and KEY not in data
+    return presumably_open(config) if reopen and is_older_run else config
 
 
 def _preset_text(path: Path, shown: str) -> str:
@@ -78,9 +88,18 @@ def to_dict(config: ExperimentConfig) -> dict[str, Any]:
     return typing.cast("dict[str, Any]", plain(dataclasses.asdict(config)))
 
 
-def to_yaml(config: ExperimentConfig) -> str:
-    """The config as YAML that ``load_config`` reads back unchanged."""
-    return yaml.safe_dump(to_dict(config), sort_keys=False, allow_unicode=True)
+def to_yaml(config: ExperimentConfig, asked: ExperimentConfig | None = None) -> str:
+    """The config as YAML that ``load_config`` reads back.
+
+    Args:
+        config: the settings.
+        asked: what it was before ``auto`` and null were decided; where it differs, a record keeps what was asked. None
+            writes no record.
+    """
+    data = to_dict(config)
+    if asked is not None:
+        data[KEY] = record(differences(asked, config))
+    return yaml.safe_dump(data, sort_keys=False)
 
 
 def differences(old: ExperimentConfig, new: ExperimentConfig) -> dict[str, tuple[Any, Any]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ class RunFolder:
         path = self.path / "config.yaml"
         if not path.is_file():
             raise RunFolderError(f"{path} is missing, expected the run's config; the run folder is damaged")
-        return load_config(path, absent=BEFORE)
+        return load_config(path, BEFORE, reopen=False)
 
     def checkpoints(self, keep: int = 2) -> CheckpointStore:
         """The run's checkpoints."""
@@ -95,8 +96,13 @@ class RunFolder:
         """The run's evaluations."""
         return Evaluations(self.path / "evaluations")
 
-    def create(self, config: ExperimentConfig, environment: dict[str, Any]) -> None:
+    def create(self, config: ExperimentConfig, environment: dict[str, Any], asked: ExperimentConfig) -> None:
         """Make the folder of a new run.
+
+        Args:
+            config: decided.
+            environment: from ``describe_environment``.
+            asked: the config before ``auto`` and null were decided.
 
         Raises:
             RunFolderError: the folder holds other files, or cannot be written.
@@ -111,7 +117,7 @@ class RunFolder:
                 )
             (self.path / "checkpoints").mkdir()
             (self.path / "evaluations").mkdir()
-            write_atomically(self.path / "config.yaml", to_yaml(config).encode())
+            write_atomically(self.path / "config.yaml", to_yaml(config, asked).encode())
             # Last: a folder is a run once this file says so.
             write_atomically(self.path / "environment.json", json_text(environment, indent=1).encode())
         except OSError as error:
@@ -141,7 +147,9 @@ class RunFolder:
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Replace the stored config (a raised step budget)."""
-        write_atomically(self.path / "config.yaml", to_yaml(config).encode())
+        path = self.path / "config.yaml"
+        asked = replace(load_config(path), total_steps=config.total_steps)
+        write_atomically(path, to_yaml(config, asked).encode())
 
     def lock(self) -> filelock.BaseFileLock:
         """Take the run for this process.

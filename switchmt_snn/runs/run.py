@@ -141,7 +141,7 @@ def _train(
     lock = folder.lock()
     try:
         if stored is None:
-            folder.create(planned.config, describe_environment(planned.config, planned.device))
+            folder.create(planned.config, describe_environment(planned.config, planned.device), config)
         elif stored != planned.config:
             folder.save_config(planned.config)
         if group is not None:

@@ -88,7 +88,7 @@ def test_presets_load_resolve_and_round_trip(preset: str, tmp_path: Path) -> Non
     assert resolve(resolved) == resolved
     path = tmp_path / "config.yaml"
     path.write_text(to_yaml(resolved))
-    assert load_config(path) == resolved
+    assert load_config(path) == load_config(path, reopen=False) == resolved
 
 
 def test_presets_that_the_project_promises() -> None:
