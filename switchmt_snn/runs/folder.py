@@ -19,7 +19,7 @@ from switchmt_snn.config import ExperimentConfig, differences, load_config, to_y
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
-from switchmt_snn.runs.files import write_atomically
+from switchmt_snn.runs.files import json_text, write_atomically
 
 RUNS = Path("runs")
 
