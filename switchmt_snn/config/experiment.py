@@ -62,6 +62,10 @@ class ExperimentConfig:
             "0 with network.normalization=shared",
             "the statistics of one task would take the place of all tasks'",
         )
+        if self.learning.first_layer_mean == "input":
+            for key, expected in (("encoding", "direct"), ("normalization", "per_task")):
+                value = getattr(self.network, key)
+                require(value == expected, f"network.{key}", value, f"{expected} with learning.first_layer_mean=input")
         goals, names = self.evaluation.stop_at_returns, self.tasks.names
         require(
             len(goals) in (0, len(names)),

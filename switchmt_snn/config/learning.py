@@ -83,6 +83,10 @@ class LearningConfig:
     """Estimate BatchNorm's running statistics of a task anew from so many batches of its replay: of Q and Q* when a
     visit to the task starts, of Q for all tasks before an evaluation and at the end. Later weights have other
     statistics, and a task that was away looks forgotten without it. 0: off."""
+    first_layer_mean: Literal["running", "input"] = "running"
+    """Where BatchNorm takes the first layer's running mean from. running: the mean of its currents over past updates.
+    input: its present weights times the running mean input, set after every update, so that the network that acts is
+    the one that learns. Over a bright, constant background (Pong) the former lags far behind."""
     epsilon_start: float = 1.0
     """Exploration at the first step."""
     epsilon_end: float = 0.1

@@ -19,6 +19,7 @@ from torch.nn import Parameter
 from switchmt_snn.config import LearningConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.clocks import linear_decay
+from switchmt_snn.learning.first_layer import FirstLayerMeans
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.replay.on_device import to_device
 from switchmt_snn.replay.ring import Batch
@@ -96,6 +97,7 @@ class Learner(Stateful):
     the running statistics of the batch's task.
 
     Attributes:
+        first_layer: sets the first layer's running means; None with ``learning.first_layer_mean=running``.
         updates: gradient steps made. ``engine`` executes them, and computes actions if ``learning.acting`` says so.
     """
 
@@ -113,6 +115,7 @@ class Learner(Stateful):
         "config",
         "device",
         "engine",
+        "first_layer",
         "_clip",
         "_decisions",
         "_invalid_KA",
@@ -155,6 +158,7 @@ class Learner(Stateful):
         self._decisions = self._acting(config.acting)
         self.optimizer = self.engine.optimizer()
         self.generator = torch.Generator(device).manual_seed(seed)
+        self.first_layer = _first_layer(config.first_layer_mean, self.network)
         self._step = self.engine.executed(self._device_step, self.optimizer, self.generator)
         self.updates = 0
         self._invalid_KA = torch.as_tensor(~valid_actions_KA, device=device)
@@ -197,6 +201,8 @@ class Learner(Stateful):
         )
         self._decay_learning_rate()
         self._step(parts, task)
+        if self.first_layer is not None:
+            self.first_layer.follow(parts.observations, task)
         self.updates += 1
         self.summed += 1
 
@@ -237,12 +243,19 @@ class Learner(Stateful):
         """theta as one vector: a copy, never a view of the live parameters (docs/algorithm.md)."""
         return torch.cat([parameter.detach().reshape(-1) for parameter in self.network.parameters()])
 
+    def state_dict(self) -> dict[str, Any]:
+        """As ``Stateful.state_dict``, and the first layer's part if there is one."""
+        part = {} if self.first_layer is None else {"first_layer": self.first_layer.state_dict()}
+        return {**super().state_dict(), **part}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Put a saved state back; JSON made the optimizer's parameter numbers text."""
         optimizer = state["optimizer"]
         numbered = {int(number): values for number, values in optimizer["state"].items()}
         state = {**state, "optimizer": {**optimizer, "state": numbered}}
         super().load_state_dict(state)
+        if self.first_layer is not None:
+            self.first_layer.load_state_dict(state["first_layer"])
         # The optimizer's tensors are others now.
         self._step = self.engine.executed(self._device_step, self.optimizer, self.generator)
 
@@ -282,6 +295,14 @@ class Learner(Stateful):
 
     def _tensor(self, array: npt.NDArray[np.generic] | Tensor) -> Tensor:
         return array if isinstance(array, Tensor) else to_device(array, self.device)
+
+
+def _first_layer(mean: str, network: QNetwork) -> FirstLayerMeans | None:
+    if mean == "running":
+        return None
+    if mean == "input":
+        return FirstLayerMeans(network)
+    raise ConfigError(f"learning.first_layer_mean is {mean!r}, expected running or input")
 
 
 def _loss_of(name: str, quantiles: int) -> Callable[[Tensor, Tensor], Tensor]:

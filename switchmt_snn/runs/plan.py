@@ -235,6 +235,11 @@ def _require_divisible(config: ExperimentConfig, processes: int) -> None:
             f"learning.reestimate_statistics_batches is {batches}, expected 0 for the {processes} processes that "
             "torchrun started: only the first one holds the replay"
         )
+    if config.learning.first_layer_mean != "running":
+        raise ConfigError(
+            f"learning.first_layer_mean is {config.learning.first_layer_mean!r}, expected running for the {processes} "
+            "processes that torchrun started: each one sees its part of a batch only"
+        )
     size = config.learning.batch_size
     if size % processes or size // processes < 2:
         raise ConfigError(
