@@ -5,12 +5,25 @@ from __future__ import annotations
 import csv
 import json
 import statistics
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import load_config
 from switchmt_snn.tasks.atari_scores import PUBLISHED_SCORES
+
+NOTES = {
+    "lagging-s1": """\
+Stopped: **Pong diverged.** Its mean Q rises to 8 while it loses every game, because the network that acts and gives
+targets is another one than the network that learns. The background of Pong is a bright constant, 0.42 of the range, so
+one Adam step moves the mean current of a channel of the first layer by a good part of its standard deviation, and
+BatchNorm's running mean stays behind (`off_conv1` below: 0.21 standard deviations; Breakout's background is black). The
+target then chooses and values actions by chance, and the largest of some random values is too large. `strong-s1` has
+`learning.first_layer_mean: input` and `learning.double_q: true` against it.
+""",
+}
+"""What a reader must know of a run."""
 
 FOLDER = Path(__file__).parents[2] / "results" / "atari"
 BIN_STEPS = 50_000
@@ -34,7 +47,11 @@ def atari_page() -> str:
 def _run(folder: Path) -> list[str]:
     config = load_config(folder / "config.yaml", reopen=False)
     games = config.tasks.names
-    last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    last = rows[-1]
+    # The clock starts anew at every resume, so each part ends where the next row's time is shorter.
+    ends = [row for row, following in pairwise(rows) if following["wall_s"] < row["wall_s"]]
+    hours = sum(row["wall_s"] for row in [*ends, last]) / 3600
     environment = json.loads((folder / "environment.json").read_text())
     state = "finished" if last["step"] >= config.total_steps else f"so far, of {config.total_steps:,}"
     by_game = ", ".join(f"{game} {count:,}" for game, count in last["steps_by_task"].items())
@@ -42,7 +59,9 @@ def _run(folder: Path) -> list[str]:
         "",
         f"## {folder.name}",
         "",
-        f"{last['step']:,} steps {state}, in {last['wall_s'] / 3600:.1f} h on one core of a machine that also did "
+        *NOTES.get(folder.name, "").splitlines(),
+        "",
+        f"{last['step']:,} steps {state}, in {hours:.1f} h on one core of a machine that also did "
         f"other work ({environment['processor']}, {environment['cores']} cores): {by_game}.",
         "",
         "Mean training return by steps of the game itself (episodes):",
@@ -64,7 +83,29 @@ def _run(folder: Path) -> list[str]:
         lines.append(_row([f"after {stored['step']:,} steps", *cells]))
     for published in PUBLISHED_SCORES:
         lines.append(_row([published.policy, *(f"{published.scores[game]:g}" for game in games)]))
-    return [*lines, "", f"Ours: mean ± standard error; {protocol}."] if protocol else lines
+    if protocol:
+        lines += ["", f"Ours: mean ± standard error; {protocol}."]
+    return [*lines, *_statistics(folder)]
+
+
+def _statistics(folder: Path) -> list[str]:
+    """The comparison of ``benchmarks/running_statistics.py``, where it was made."""
+    path = folder / "running_statistics.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as stream:
+        found = list(csv.DictReader(stream))
+    lines = [
+        "",
+        "The network that acts against the same network with BatchNorm statistics estimated anew from the replay",
+        "(`python -m benchmarks.running_statistics RUN`): correlation of the largest Q-values, how often both choose",
+        "the same action, mean largest Q-value, and how far a layer's running means are off in standard deviations",
+        "(median).",
+        "",
+    ]
+    columns = [name for name in found[0] if name not in ("run", "q_fresh")]
+    lines += [_row(columns), _row(["---:"] * len(columns))]
+    return [*lines, *(_row([f"{int(row['step']):,}", *(row[name] for name in columns[1:])]) for row in found)]
 
 
 def _returns(folder: Path, games: tuple[str, ...]) -> dict[str, dict[int, list[float]]]:

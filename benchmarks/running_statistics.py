@@ -1,0 +1,103 @@
+"""Whether the network that acts is the one that learns: BatchNorm's running statistics of a stored run.
+
+``python -m benchmarks.running_statistics RUN [--out FILE.csv]``. The newest checkpoint's network plays with running
+statistics; it learns with those of the batch. For each task both give Q-values of the same observations from the
+replay: the second set with statistics that were estimated anew, over many batches. Written for each task: the
+correlation of their largest Q-values, how often both choose the same action, and their means; and for each layer how
+far the running mean is off, in standard deviations of its currents.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import csv
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from switchmt_snn.learning.statistics import reestimate_statistics
+from switchmt_snn.learning.training import Training
+from switchmt_snn.replay.ring import Returns
+from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.plan import plan
+from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.spiking.normalization import TaskBatchNorm
+
+BATCHES, BATCH_SIZE, SEED = 16, 64, 0
+
+
+def rows(run: Path) -> Iterator[dict[str, Any]]:
+    """One row for each task of a run's newest checkpoint."""
+    folder = RunFolder(run)
+    config = folder.config()
+    planned = plan(config, config)
+    training = Training(planned.config, planned.suite, planned.device)
+    loaded = folder.checkpoints().load(training.replays)
+    training.load_state_dict(loaded.state)
+    try:
+        for task, name in enumerate(training.suite.names):
+            if not training.is_warming_up(task):
+                yield {"run": run.name, "step": loaded.step, "task": name, **_compare(training, task)}
+    finally:
+        training.close()
+
+
+def _compare(training: Training, task: int) -> dict[str, float]:
+    rng, device = np.random.default_rng(SEED), training.learner.device
+    replay, running = training.replays[task], training.learner.network.eval()
+    seen = [torch.as_tensor(replay.sample(BATCH_SIZE, rng, Returns()).observations) for _ in range(2 * BATCHES)]
+    fresh = copy.deepcopy(running)
+    reestimate_statistics([fresh], task, (x.to(device) for x in seen[:BATCHES]), torch.Generator(device))
+    valid = torch.from_numpy(training.suite.valid_actions_KA[task])
+    ours, theirs = (_q_values(net, seen[BATCHES:], task)[:, valid] for net in (running, fresh))
+    largest = torch.stack([ours.amax(1), theirs.amax(1)])
+    return {
+        "correlation": float(torch.corrcoef(largest)[0, 1]),
+        "same_action": float((ours.argmax(1) == theirs.argmax(1)).float().mean()),
+        "q_running": float(largest[0].mean()),
+        "q_fresh": float(largest[1].mean()),
+        **{f"off_{name}": value for name, value in _distances(running, fresh, task).items()},
+    }
+
+
+@torch.no_grad()
+def _q_values(network: QNetwork, batches: list[Tensor], task: int) -> Tensor:
+    device = next(network.parameters()).device
+    return torch.cat([network(x.to(device), task).cpu() for x in batches])
+
+
+def _distances(running: QNetwork, fresh: QNetwork, task: int) -> dict[str, float]:
+    """Median over a layer's channels of |running mean - fresh mean| / fresh standard deviation."""
+    found = {}
+    theirs = dict(fresh.named_modules())
+    for name, layer in running.named_modules():
+        if isinstance(layer, TaskBatchNorm):
+            mean_C, (fresh_mean_C, fresh_var_C) = layer.statistics(task)[0], theirs[name].statistics(task)
+            off_C = (mean_C - fresh_mean_C).abs() / fresh_var_C.sqrt().clamp_min(1e-6)
+            found[name.split(".")[1]] = float(off_C.median())
+    return found
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder with a checkpoint and its replay")
+    parser.add_argument("--out", type=Path, metavar="FILE.csv", help="write here; the default is the terminal")
+    arguments = parser.parse_args()
+    found = list(rows(arguments.run))
+    with arguments.out.open("w", newline="") if arguments.out else sys.stdout as stream:
+        writer = csv.DictWriter(stream, list(found[0]))
+        writer.writeheader()
+        writer.writerows(
+            {key: f"{value:.4f}" if isinstance(value, float) else value for key, value in row.items()} for row in found
+        )
+
+
+if __name__ == "__main__":
+    main()
