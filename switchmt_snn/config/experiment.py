@@ -33,7 +33,7 @@ class ExperimentConfig:
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Where the network runs; auto takes cuda, else mps, else cpu."""
     threads: int | None = None
-    """CPU threads of torch; null leaves torch's choice. Exact resume needs the same number."""
+    """CPU threads of torch; null leaves torch's choice. A run that is continued keeps the number that it began with."""
     tasks: TasksConfig = field(default_factory=TasksConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)

@@ -8,7 +8,7 @@ import os
 import platform
 import shlex
 import sys
-import time
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ def describe_environment(config: ExperimentConfig, device: torch.device) -> dict
     return {
         "program": "switchmt-snn",
         "command": command_line(),
-        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "created": datetime.now().astimezone().isoformat(timespec="microseconds"),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "processor": processor(),

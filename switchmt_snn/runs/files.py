@@ -58,7 +58,7 @@ def _finite(value: Any) -> Any:
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that a crash at any moment leaves the old content or the new one."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # another process may write the same file
     try:
         with temporary.open("wb") as stream:
             stream.write(content)

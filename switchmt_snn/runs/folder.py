@@ -6,9 +6,11 @@ config.yaml  environment.json  code_changes.jsonl  metrics.jsonl  episodes.csv  
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import time
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,25 +26,46 @@ from switchmt_snn.runs.files import json_text, write_atomically
 RUNS = Path("runs")
 
 
-def new_run_path(name: str) -> Path:
-    """A fresh folder under ``runs/``, named by time and config."""
+def claim_new_run(name: str) -> RunFolder:
+    """Make a fresh folder under ``runs/``, named by time and config.
+
+    Making a folder is atomic, so of several trainings that begin in one second each gets a folder of its own.
+
+    Raises:
+        RunFolderError: it cannot be made.
+    """
     base = RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{name}"
-    path, number = base, 2
-    while path.exists():
-        path, number = Path(f"{base}-{number}"), number + 1
-    return path
+    for number in itertools.count(1):
+        path = base if number == 1 else base.with_name(f"{base.name}-{number}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise RunFolderError(_unwritable(path, error)) from error
+        return RunFolder(path)
+    raise AssertionError("unreachable: the numbers do not end")
 
 
 def latest_run() -> Path:
-    """The newest run under ``runs/``.
+    """The run under ``runs/`` that was begun last, as its environment.json says; a copied file may be younger.
 
     Raises:
         RunFolderError: there is none.
     """
-    runs = [path.parent for path in RUNS.glob("*/environment.json")]
+    begun = {path.parent: _begun(path) for path in RUNS.glob("*/environment.json")}
+    runs = [(moment, run.name, run) for run, moment in begun.items() if moment is not None]
     if not runs:
         raise RunFolderError(f"no run in {RUNS.resolve()}, expected one; run switchmt-snn train, or name a run folder")
-    return max(runs, key=lambda run: ((run / "environment.json").stat().st_mtime, run.name))
+    return max(runs)[-1]
+
+
+def _begun(path: Path) -> datetime | None:
+    """When a run was begun; None if the file is not of a run."""
+    try:
+        return datetime.fromisoformat(json.loads(path.read_bytes())["created"]).astimezone()
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 BEFORE = {"tasks": {"image_layout": "channels_last"}}
@@ -79,6 +102,23 @@ class RunFolder:
                 "name another folder"
             )
         return self
+
+    def require_unchanged(self, was_run: bool) -> None:
+        """Refuse a folder that another process made a run of while this one was planned.
+
+        Raises:
+            RunFolderError: it became a run in the meantime.
+        """
+        if self.is_run and not was_run:
+            raise RunFolderError(
+                f"{self.path} became a run of another process in the meantime, expected a free folder; run the same "
+                "command again to continue it, or name another one with --run"
+            )
+
+    def threads(self) -> int | None:
+        """The threads of PyTorch with which the run began; None if it does not say."""
+        threads = json.loads((self.path / "environment.json").read_bytes()).get("torch_threads")
+        return threads if isinstance(threads, int) else None
 
     def config(self) -> ExperimentConfig:
         """The run's resolved config."""
@@ -122,28 +162,6 @@ class RunFolder:
             write_atomically(self.path / "environment.json", json_text(environment, indent=1).encode())
         except OSError as error:
             raise RunFolderError(_unwritable(self.path, error)) from error
-
-    def changed_files(self, files_sha256: dict[str, str], step: int) -> list[str]:
-        """Names of files that changed since the run last went on; the new hashes are added to ``code_changes.jsonl``.
-
-        Args:
-            files_sha256: of today's files, as in environment.json. A file that the run does not know yet is recorded
-                without being named.
-            step: at which the run goes on.
-        """
-        path = self.path / "code_changes.jsonl"
-        try:
-            known = dict(json.loads((self.path / "environment.json").read_bytes()).get("files_sha256", {}))
-            rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-            for row in rows:
-                known |= row["files_sha256"]
-            new = {name: digest for name, digest in files_sha256.items() if known.get(name) != digest}
-            if new:
-                rows.append({"step": step, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "files_sha256": new})
-                write_atomically(path, "".join(json_text(row) + "\n" for row in rows).encode())
-        except (ValueError, TypeError, KeyError) as error:
-            raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected JSON lines; delete it") from error
-        return [name for name in new if name in known]
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Replace the stored config (a raised step budget)."""

@@ -25,9 +25,10 @@ from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
+from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_weights
-from switchmt_snn.runs.environment import describe_environment, files_sha256
-from switchmt_snn.runs.folder import RunFolder, check_same_config, latest_run, new_run_path
+from switchmt_snn.runs.environment import describe_environment
+from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run, latest_run
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.plan import decide, plan
 from switchmt_snn.spiking.network import build_network
@@ -123,8 +124,8 @@ def _train(
 ) -> RunResult:
     if isinstance(config, (str, Path)):
         config = load_config(config)
-    folder = RunFolder(Path(run) if run is not None else Path(new_run_path(_name_of(config))))
-    stored = folder.config() if folder.is_run else None
+    folder = RunFolder(Path(run)) if run is not None else None
+    stored = folder.config() if folder is not None and folder.is_run else None
     if config is None:
         config = stored or load_config("quickstart")
     if policy is not None:
@@ -132,14 +133,20 @@ def _train(
     if suite is not None:
         config = replace(config, tasks=replace(config.tasks, suite=plugin_name(register_suite(suite), "suite")))
     planned = plan(config, stored) if group is None else plan(config, stored, group.size, group.device(config.device))
-    if stored is not None:
+    if folder is not None and stored is not None:
         check_same_config(decide(stored, stored, planned.suite, planned.device)[0], planned.config, folder.path)
     torch.backends.cudnn.deterministic = True  # exact resume; benchmark mode would choose kernels by the clock
-    if planned.config.threads is not None:
-        torch.set_num_threads(planned.config.threads)
+    threads = planned.config.threads
+    if threads is None and folder is not None and stored is not None:
+        threads = folder.threads()  # sums have the order that they had
+    if threads is not None:
+        torch.set_num_threads(threads)
     keep_freed_memory()
+    if folder is None:
+        folder = claim_new_run(config.name)
     lock = folder.lock()
     try:
+        folder.require_unchanged(stored is not None)
         if stored is None:
             folder.create(planned.config, describe_environment(planned.config, planned.device), config)
         elif stored != planned.config:
@@ -167,10 +174,6 @@ def _serve(group: ProcessGroup) -> RunResult:
     rewards = numbers.astype(np.float32)
     learner.serve(Batch(observations, numbers, rewards, observations, numbers.astype(np.bool_), rewards))
     return RunResult(Path(), "served", learner.updates, None)
-
-
-def _name_of(config: ExperimentConfig | None) -> str:
-    return config.name if config is not None else "quickstart"
 
 
 class _Driver:
@@ -245,13 +248,8 @@ class _Driver:
         with fitting_weights():
             self.training.load_state_dict(loaded.state)
         notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]
-        changed = self.folder.changed_files(files_sha256(self.config), loaded.step)
-        if changed:
-            notes.append(
-                f"warning: the code of {', '.join(changed)} changed since the run last went on; it continues from step "
-                f"{loaded.step:,} with the new code, so its numbers before and after may not belong together "
-                "(code_changes.jsonl)"
-            )
+        environment = describe_environment(self.config, self.training.learner.device)
+        notes += note_changes(self.folder.path, environment, loaded.step)
         if not self.training.reproducible:
             notes.append(
                 "the environment did not repeat its running episodes from seed and actions; the run goes on, but not "

@@ -10,10 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from switchmt_snn import load_agent, train
 from switchmt_snn.config import ExperimentConfig, from_dict
 from switchmt_snn.errors import CheckpointError
+from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.folder import RunFolder
 from tests.recipes import code_of
 
@@ -126,6 +128,35 @@ def test_a_state_that_the_checkpoint_does_not_have_is_one_line(folder: Path) -> 
 
 def test_a_file_that_an_older_run_did_not_hash_is_recorded_without_a_warning(folder: Path) -> None:
     run = RunFolder(folder / "run")
-    assert run.changed_files({"my_new": "0" * 64}, 60) == []
-    assert run.changed_files({"my_new": "1" * 64}, 65) == ["my_new"]
-    assert run.changed_files({"my_new": "1" * 64}, 70) == []
+    assert note_changes(run.path, {"files_sha256": {"my_new": "0" * 64}}, 60) == []
+    (warning,) = note_changes(run.path, {"files_sha256": {"my_new": "1" * 64}}, 65)
+    assert "the code of my_new changed" in warning
+    assert note_changes(run.path, {"files_sha256": {"my_new": "1" * 64}}, 70) == []
+
+
+def test_conditions_that_changed_before_a_resume_are_named_once(folder: Path) -> None:
+    """A resume is bitwise only under the same versions, processor, device and threads."""
+    path = folder / "run"
+    begun = json.loads((path / "environment.json").read_text())
+    assert note_changes(path, begun, 60) == []
+    now = {**begun, "torch_threads": 7, "processor": "another", "versions": {**begun["versions"], "torch": "0.1"}}
+    (warning,) = note_changes(path, now, 60)
+    for words in ("torch_threads (1 -> 7)", f"torch ({begun['versions']['torch']} -> 0.1)", "-> another)"):
+        assert words in warning
+    assert "not bitwise as it would have" in warning
+    assert note_changes(path, now, 70) == [], "told once"
+    rows = [json.loads(line) for line in (path / "code_changes.jsonl").read_text().splitlines()]
+    assert rows[0]["conditions"] == {"processor": "another", "torch_threads": 7, "versions.torch": "0.1"}
+
+
+def test_a_continued_run_has_the_threads_that_it_began_with(tmp_path: Path) -> None:
+    data = {"tasks": {"suite": "gym", "names": ["CartPole-v1"]}, "network": {"hidden_units": 8}, "device": "cpu"}
+    learning = {"batch_size": 8, "learning_starts_steps": 30, "replay_capacity_steps": 100}
+    config = from_dict({**data, "learning": learning, "total_steps": 60, "evaluation": {"episodes": 1}})
+    torch.set_num_threads(2)
+    train(config, run=tmp_path / "run")
+    torch.set_num_threads(1)
+    notes = Notes()
+    train(replace(config, total_steps=90), run=tmp_path / "run", observers=[notes])
+    assert torch.get_num_threads() == 2
+    assert not [text for text in notes.texts if text.startswith("warning")]

@@ -1,0 +1,55 @@
+"""Run folders: which one a new run gets, and which one is the newest."""
+
+from __future__ import annotations
+
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from switchmt_snn.errors import RunFolderError
+from switchmt_snn.runs.folder import RunFolder, claim_new_run, latest_run
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def begun(name: str, created: str, file_time: float) -> Path:
+    path = Path("runs") / name / "environment.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"program": "switchmt-snn", "created": created}))
+    os.utime(path, (file_time, file_time))
+    return path.parent
+
+
+def test_trainings_that_begin_together_get_folders_of_their_own() -> None:
+    with ThreadPoolExecutor(12) as pool:
+        folders = list(pool.map(claim_new_run, ["same"] * 24))
+    paths = {folder.path for folder in folders}
+    assert len(paths) == 24
+    assert all(path.is_dir() and "_same" in path.name for path in paths)
+
+
+def test_a_folder_that_became_a_run_in_the_meantime_is_refused() -> None:
+    folder = RunFolder(begun("a", "2026-01-01T00:00:00+0000", 0))
+    folder.require_unchanged(was_run=True)
+    with pytest.raises(RunFolderError, match="became a run of another process in the meantime"):
+        folder.require_unchanged(was_run=False)
+
+
+def test_the_newest_run_was_begun_last_whatever_the_times_of_its_files() -> None:
+    begun("copied", "2026-01-02T10:00:00+0000", file_time=9_000)
+    newest = begun("newest", "2026-01-02T12:30:00.000001+02:00", file_time=1_000)
+    begun("same-second", "2026-01-02T10:30:00+0000", file_time=5_000)
+    (Path("runs") / "broken").mkdir()
+    (Path("runs") / "broken" / "environment.json").write_text("{}")
+    assert latest_run() == newest
+
+
+def test_without_a_run_there_is_no_newest() -> None:
+    with pytest.raises(RunFolderError, match="run switchmt-snn train, or name a run folder"):
+        latest_run()
