@@ -154,9 +154,14 @@ class NeuronCounter:
 
     @property
     def rate_histogram(self) -> tuple[int, ...]:
-        """Number of neurons that fire in each of ``RATE_BINS`` equal ranges of spikes per step."""
-        rate_N = self.rate_N
-        return tuple(np.histogram(rate_N[rate_N > 0], RATE_BINS, (0.0, 1.0))[0].tolist())
+        """Number of neurons that fire in each of ``RATE_BINS`` equal ranges of spikes per step.
+
+        A rate on the edge of two ranges belongs to the upper one, and 1 to the last: counted in integers, as a rate
+        like 0.15 has no exact float.
+        """
+        spikes_N, steps = self.spikes_TN.sum(axis=0), max(1, self.decisions * len(self.spikes_TN))
+        bins_N = np.minimum(spikes_N[spikes_N > 0] * RATE_BINS // steps, RATE_BINS - 1)
+        return tuple(np.bincount(bins_N, minlength=RATE_BINS).tolist())
 
     @property
     def silent(self) -> int:

@@ -10,7 +10,16 @@ from onnx import helper
 
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.formats.onnx_graph import FLOAT, OPSET, Graph
-from switchmt_snn.spiking.encodings import ENCODINGS, Direct, Encoding, Events, Frames, Latency, encoding_class
+from switchmt_snn.spiking.encodings import (
+    ENCODINGS,
+    EVENT_MARGIN,
+    Direct,
+    Encoding,
+    Events,
+    Frames,
+    Latency,
+    encoding_class,
+)
 from switchmt_snn.spiking.folding import FoldedNetwork
 
 Rule = Callable[[Graph, FoldedNetwork, str], str]
@@ -131,7 +140,7 @@ def _events(graph: Graph, network: FoldedNetwork, x: str) -> str:
     darkness = graph.add("Mul", [first, graph.constant("zero", 0.0)], "darkness")
     before = graph.add("Concat", [darkness, older], "before", axis=0)
     change = graph.add("Sub", [frames, before], "change")
-    threshold = network.settings.event_threshold
+    threshold = network.settings.event_threshold + EVENT_MARGIN
     on = graph.add("Greater", [change, graph.constant("on_above", threshold)], "on")
     off = graph.add("Less", [change, graph.constant("off_below", -threshold)], "off")
     return graph.add("Cast", [graph.add("Concat", [on, off], "events", axis=2)], "encoded", to=FLOAT)

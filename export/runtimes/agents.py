@@ -21,7 +21,7 @@ from switchmt_snn.acting.evaluation import DecisionMaker
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
-from switchmt_snn.spiking.encodings import make_encoding
+from switchmt_snn.spiking.encodings import encoding_class, make_encoding
 from switchmt_snn.spiking.layers import ReadoutNode
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -120,6 +120,11 @@ class OnnxAgent:
         other._generator = torch.Generator()
         return other
 
+    @property
+    def draws(self) -> bool:
+        """Whether a decision draws random numbers: of a random encoding."""
+        return encoding_class(self.config.network.encoding).is_random
+
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of the ``rate`` encoding."""
         self._generator.manual_seed(seed)
@@ -165,6 +170,11 @@ class NirAgent:
         other._generator = torch.Generator()
         return other
 
+    @property
+    def draws(self) -> bool:
+        """Whether a decision draws random numbers: of a random encoding."""
+        return encoding_class(self.config.network.encoding).is_random
+
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of the ``rate`` encoding."""
         self._generator.manual_seed(seed)
@@ -196,6 +206,11 @@ class ComparedAgent:
         other = ComparedAgent(self.runtime.independent(), self.reference.independent())
         other.compared = self.compared
         return other
+
+    @property
+    def draws(self) -> bool:
+        """As the runtime."""
+        return self.runtime.draws
 
     def reseed(self, seed: int) -> None:
         """Restart both."""

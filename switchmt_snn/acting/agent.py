@@ -11,6 +11,7 @@ import torch
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import TaskError
+from switchmt_snn.spiking.encodings import encoding_class
 from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -39,6 +40,11 @@ class Agent:
     def independent(self) -> Agent:
         """The same agent for another thread (snnTorch's neurons write into themselves, a generator moves on)."""
         return Agent(copy.deepcopy(self.network), self.suite, self.config, self.device, self.step)
+
+    @property
+    def draws(self) -> bool:
+        """Whether a greedy decision draws random numbers: of a random encoding."""
+        return encoding_class(self.config.network.encoding).is_random
 
     def reseed(self, seed: int) -> None:
         """Restart the random numbers of the ``rate`` encoding, the only randomness of a greedy decision."""

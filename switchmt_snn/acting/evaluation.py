@@ -27,6 +27,10 @@ class DecisionMaker(Protocol):
     suite: TaskSuite
     step: int
 
+    @property
+    def draws(self) -> bool:
+        """Whether decisions draw random numbers (a random encoding), even greedy ones."""
+
     def independent(self) -> DecisionMaker:
         """The same agent for another thread: it shares nothing with this one that changes."""
 
@@ -160,8 +164,8 @@ def evaluate_agent(
         if policy == "random":
             return play_episodes(policy, None, suite, task, numbers, protocol.seed, 1.0)
         own = agent.independent()
-        own.reseed(episode_seed(protocol.seed, task, numbers[0]))
-        return play_episodes(policy, own.q_values, suite, task, numbers, protocol.seed, protocol.epsilon)
+        reseed = own.reseed if own.draws else None
+        return play_episodes(policy, own.q_values, suite, task, numbers, protocol.seed, protocol.epsilon, reseed)
 
     with all_cores() as pool:
         episodes = [episode for group in pool.map(played, groups) for episode in group]
@@ -180,6 +184,7 @@ def play_episodes(
     numbers: Sequence[int],
     seed: int,
     epsilon: float,
+    reseed: Callable[[int], None] | None = None,
 ) -> list[EpisodeScore]:
     """Play episodes of a task side by side with epsilon-greedy actions.
 
@@ -191,10 +196,13 @@ def play_episodes(
         numbers: of the episodes.
         seed: root of the episodes' seeds.
         epsilon: share of random actions.
+        reseed: of decisions that draw random numbers. They are then drawn anew from an episode's seed for each of its
+            decisions, so that an episode does not depend on those beside it; one decision is made after the other.
     """
     play = Play(suite, task, len(numbers))
     try:
-        return sorted(_played(policy, q_function, suite, play, numbers, seed, epsilon), key=lambda e: e.episode)
+        scores = _played(policy, q_function, suite, play, numbers, seed, epsilon, reseed)
+        return sorted(scores, key=lambda e: e.episode)
     finally:
         play.close()
 
@@ -207,6 +215,7 @@ def _played(
     numbers: Sequence[int],
     seed: int,
     epsilon: float,
+    reseed: Callable[[int], None] | None,
 ) -> Iterator[EpisodeScore]:
     n, task = play.num_envs, play.task
     valid = np.flatnonzero(suite.valid_actions_KA[task])
@@ -219,7 +228,8 @@ def _played(
         actions = np.asarray([valid[rng.integers(len(valid))] for rng in rngs], np.int64)
         if q_function is not None:
             asked = np.flatnonzero(running)
-            q_nA = q_function(play.observations[asked], task)
+            drawn = [(seed, task, int(numbers[int(env)]), int(play.lengths_steps[env])) for env in asked]
+            q_nA = _decided(q_function, play.observations[asked], task, drawn, reseed)
             q_sums[asked] += q_nA.max(axis=1)
             actions[asked] = np.where(explore[asked], actions[asked], q_nA.argmax(axis=1))
         played = play.step(actions)
@@ -239,6 +249,23 @@ def _played(
             running[env] = False
             # An idle copy starts its episode again, unobserved: environments must not be stepped past an end.
             play.begin(np.asarray([env]), seeds[env : env + 1])
+
+
+def _decided(
+    q_function: QFunction,
+    observations: npt.NDArray[Any],
+    task: int,
+    drawn: Sequence[tuple[int, ...]],
+    reseed: Callable[[int], None] | None,
+) -> npt.NDArray[np.float32]:
+    """Q-values ``[n, A]``; where they draw random numbers, each by itself from its entry in ``drawn``."""
+    if reseed is None:
+        return q_function(observations, task)
+    q_values = []
+    for observation, place in zip(observations, drawn, strict=True):
+        reseed(int(np.random.default_rng(place).integers(2**62)))
+        q_values.append(q_function(observation[None], task))
+    return np.concatenate(q_values)
 
 
 def summarize(suite: TaskSuite, episodes: list[EpisodeScore]) -> TaskScore:

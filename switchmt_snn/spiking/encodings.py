@@ -270,18 +270,23 @@ class Frames(Encoding):
         return frames_over_time(x, self.frame_stack)
 
 
+EVENT_MARGIN = 2.0**-20
+"""Added to ``event_threshold``: scaled float32 pixels round, so a change of k / 255 lies up to 1.2e-7 from it."""
+
+
 @register_encoding("events")
 class Events(Encoding):
     """ON and OFF spikes where a frame is brighter or darker than the one before it by more than ``event_threshold``.
 
-    The first frame is compared with darkness. T = k; ON and OFF are channels of their own.
+    The first frame is compared with darkness. T = k; ON and OFF are channels of their own. A change that equals the
+    threshold is no event, however bright the pixels are: see ``EVENT_MARGIN``.
     """
 
     makes_spikes = True
 
     def __init__(self, config: NetworkConfig, frame_stack: int) -> None:
         super().__init__(config, frame_stack)
-        self.threshold = config.event_threshold
+        self.threshold = config.event_threshold + EVENT_MARGIN
 
     @classmethod
     def channels(cls, observation_channels: int, frame_stack: int) -> int:

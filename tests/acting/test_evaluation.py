@@ -16,6 +16,7 @@ import torch
 from switchmt_snn.acting import evaluation
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import (
+    DecisionMaker,
     EpisodeScore,
     EvaluationProtocol,
     evaluate_agent,
@@ -26,6 +27,9 @@ from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.export.folded import fold_agent, metadata
+from switchmt_snn.export.formats.files import nir_graphs
+from switchmt_snn.export.formats.onnx_writer import decision_model
+from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.atari import AtariSuite
@@ -53,6 +57,29 @@ def test_every_episode_is_played_once_with_its_own_seed() -> None:
     assert len({score.seed for score in scores}) == 7
     assert all(score.score == 45 and score.length_steps == 9 and score.mean_q == 2.0 for score in scores)
     assert {score.truncated for score in scores} == {score.seed % 2 == 0 for score in scores}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["torch", "onnx", "nir"])
+def test_an_episode_of_a_random_encoding_does_not_depend_on_how_many_are_played_at_once(kind: str) -> None:
+    """Grey pixels, so that what is drawn matters; the third episode used to change with num_envs."""
+    agent = minatar_agent(encoding="rate")
+    agent.suite = replace(agent.suite, scale=0.5)
+    agent.network.observation = replace(agent.network.observation, scale=0.5)
+    played: DecisionMaker = agent
+    network = fold_agent(agent)
+    if kind == "onnx":
+        played = OnnxAgent(decision_model(network).SerializeToString(), agent.suite, agent.config)
+    elif kind == "nir":
+        played = NirAgent(nir_graphs(network), agent.suite, agent.config)
+    assert played.draws
+    protocol = replace(PROTOCOL, episodes=4)
+
+    def scores(**changes: int) -> list[tuple[float, int]]:
+        return [(e.score, e.length_steps) for e in evaluate_agent(played, replace(protocol, **changes)).episodes]
+
+    assert scores(num_envs=1) == scores(num_envs=3) == scores(num_envs=4)
+    assert scores(seed=1) != scores()
 
 
 @pytest.mark.slow

@@ -65,6 +65,18 @@ def test_spikes_silent_and_saturated_neurons() -> None:
     assert (counter.silent, counter.saturated) == (1, 1)
 
 
+def test_a_rate_on_the_edge_of_two_bins_belongs_to_the_upper_one() -> None:
+    """k of 20 spikes for k = 0 ... 20: one neuron in each of the 20 bins, and the saturated one in the last."""
+    counter = NeuronCounter("n", (21,), 4)
+    spikes = np.zeros((4, 5, 21), np.bool_)
+    for k in range(21):
+        spikes.reshape(20, 21)[:k, k] = True
+    counter.add(spikes)
+    assert counter.rate_N.tolist() == [k / 20 for k in range(21)]
+    assert counter.rate_histogram == (0, *[1] * 18, 2)
+    assert NeuronCounter("n", (3,), 2).rate_histogram == (0,) * 20
+
+
 LAYERS = {
     "linear": st.booleans(),
     "channels": st.integers(1, 5),

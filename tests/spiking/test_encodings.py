@@ -56,6 +56,20 @@ def test_events_are_on_and_off_changes() -> None:
     assert out[:, 0, 1, 0, 0].tolist() == [0, 0, 0, 1]  # darker: 0.9 -> 0.1
 
 
+@pytest.mark.parametrize("step", [1, 5, 51, 100])
+def test_whether_a_change_of_bytes_is_an_event_does_not_depend_on_brightness(step: int) -> None:
+    """A threshold of k / 255, which no float holds: changes by k are none, by k + 1 are some, at every brightness."""
+    dark = torch.arange(255 - step, dtype=torch.float32)  # 0 ... 254 - k
+    for change, expected in ((step, 0.0), (step + 1, 1.0)):
+        frames = torch.stack([dark, dark + change, dark], dim=1).view(-1, 3, 1, 1) * (1.0 / 255.0)
+        events = make_encoding(
+            NetworkConfig(encoding="events", timesteps=3, event_threshold=step / 255), 3, in_unit_range=True
+        )
+        on, off = events(frames)[1, :, 0], events(frames)[2, :, 1]
+        assert (on == expected).all()
+        assert (off == expected).all()
+
+
 def test_vectors_cannot_be_rate_encoded() -> None:
     with pytest.raises(ConfigError, match=r"expected one of direct, frames, events .*; rate needs values in \[0, 1\]"):
         make_encoding(NetworkConfig(encoding="rate"), 1, in_unit_range=False)
