@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
-from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.machine.cores import parts
 from switchmt_snn.runs.files import file_name
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
@@ -49,17 +49,19 @@ def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recor
     """``recorded_play`` of every task in turn; while one is used, the next are being played."""
 
     def one(task: str) -> Recording:
-        return recorded_play(agent.independent(), folder, task, decisions)
+        return recorded_play(agent.independent(), folder, task, decisions, work.check)
 
-    with all_cores() as pool:
-        yield from pool.map(one, agent.suite.names)
+    with parts(in_threads=agent.suite.thread_safe) as work:
+        yield from work.map(one, agent.suite.names)
 
 
-def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Recording:
+def recorded_play(
+    agent: Agent, folder: Path, task: str, decisions: int, go_on: Callable[[], None] | None = None
+) -> Recording:
     """``decisions`` recorded decisions of a task, rounded up to whole steps of all copies.
 
     Read if ``folder`` has as many, else played and stored; the same ones either way. Played like an evaluation: greedy
-    with the run's evaluation epsilon and seed.
+    with the run's evaluation epsilon and seed. ``go_on`` is called before every step; what it raises ends the play.
     """
     config = agent.config.evaluation
     path = folder / f"{file_name(task)}-step-{agent.step}.npz"
@@ -67,7 +69,7 @@ def recorded_play(agent: Agent, folder: Path, task: str, decisions: int) -> Reco
         recording = _read(path, task, agent.suite)
         if len(recording.actions) >= decisions and recording.seed == config.seed:
             return _first(recording, decisions)
-    recording = play(agent, task, decisions, config.epsilon, config.seed)
+    recording = play(agent, task, decisions, config.epsilon, config.seed, go_on)
     folder.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp.npz")
     np.savez_compressed(
@@ -108,16 +110,18 @@ def _read(path: Path, task: str, suite: TaskSuite) -> Recording:
     return recording
 
 
-def play(agent: Agent, task: str, decisions: int, epsilon: float, seed: int) -> Recording:
+def play(
+    agent: Agent, task: str, decisions: int, epsilon: float, seed: int, go_on: Callable[[], None] | None = None
+) -> Recording:
     """Play at least ``decisions`` decisions of a task in ``COPIES`` copies."""
-    pieces = list(play_in_pieces(agent, task, decisions, epsilon, seed))
+    pieces = list(play_in_pieces(agent, task, decisions, epsilon, seed, go_on))
     observations, actions = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
     flat = observations.reshape(-1, *agent.suite.observation_shape)
     return Recording(task, flat, actions.reshape(-1), epsilon, seed)
 
 
 def play_in_pieces(
-    agent: Agent, task: str, decisions: int, epsilon: float, seed: int
+    agent: Agent, task: str, decisions: int, epsilon: float, seed: int, go_on: Callable[[], None] | None = None
 ) -> Iterator[tuple[npt.NDArray[Any], npt.NDArray[np.int64]]]:
     """``play`` step by step: observations ``[COPIES, n, *shape]`` and actions ``[COPIES, n]``, n a few steps."""
     index, suite = agent.suite.index(task), agent.suite
@@ -132,6 +136,8 @@ def play_in_pieces(
             observations = np.empty((COPIES, steps, *suite.observation_shape), suite.frame_dtype)
             actions = np.empty((COPIES, steps), np.int64)
             for step in range(steps):
+                if go_on is not None:
+                    go_on()
                 over = np.flatnonzero(copies.over)
                 if len(over):
                     copies.begin(over, np.asarray([episode_seed(seed, index, episodes + i) for i in range(len(over))]))

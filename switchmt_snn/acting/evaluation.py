@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,13 +12,20 @@ import numpy.typing as npt
 
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.config.numbers import exact
-from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.machine.cores import parts
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 
+LONG_EPISODE_STEPS = 30_000
+"""Episodes that are longer are announced: Atari's longest have 27,000 steps."""
+
 QFunction = Callable[[npt.NDArray[Any], int], npt.NDArray[np.float32]]
 """Stacked observations ``[n, ...]`` and a task -> Q-values ``[n, A]``, -inf where an action does not exist."""
+
+
+class EvaluationStopped(Exception):
+    """An evaluation ended early because its caller asked for it."""
 
 
 class DecisionMaker(Protocol):
@@ -54,6 +61,7 @@ class EvaluationProtocol:
         seed: root of the episodes' seeds and of the random actions.
         num_envs: episodes that are played side by side.
         suite: value of ``tasks.suite``.
+        max_episode_steps: an episode that has not ended after so many steps is cut off, with the return that it has.
         environment: the suite's conditions of play in words, as ``sticky actions 0.25``.
         score: what is summed.
     """
@@ -65,6 +73,7 @@ class EvaluationProtocol:
     suite: str
     environment: tuple[str, ...] = ()
     score: str = "raw return, unclipped"
+    max_episode_steps: int = EvaluationConfig.max_episode_steps
 
     @classmethod
     def of(cls, evaluation: EvaluationConfig, tasks: TasksConfig) -> EvaluationProtocol:
@@ -75,6 +84,7 @@ class EvaluationProtocol:
             seed=evaluation.seed,
             num_envs=min(evaluation.num_envs, evaluation.episodes),
             suite=tasks.suite,
+            max_episode_steps=evaluation.max_episode_steps,
             environment=suite_of(tasks).protocol,
         )
 
@@ -88,8 +98,15 @@ class EvaluationProtocol:
         return cls(**own, environment=suite_of(TasksConfig(**settings)).protocol)
 
     def __str__(self) -> str:
-        played = (f"{self.episodes} episodes per task", f"epsilon {exact(self.epsilon)}")
-        return ", ".join([*played, self.score, f"seed {self.seed}", *self.environment])
+        played = [
+            f"{self.episodes} episodes per task",
+            f"epsilon {exact(self.epsilon)}",
+            self.score,
+            f"seed {self.seed}",
+        ]
+        if self.max_episode_steps != EvaluationConfig.max_episode_steps:
+            played.append(f"episodes of at most {self.max_episode_steps:,} steps")
+        return ", ".join([*played, *self.environment])
 
 
 @dataclass(frozen=True)
@@ -140,15 +157,28 @@ class Evaluation:
 
 
 def evaluate_agent(
-    agent: DecisionMaker, protocol: EvaluationProtocol, tasks: tuple[str, ...] | None = None
+    agent: DecisionMaker,
+    protocol: EvaluationProtocol,
+    tasks: tuple[str, ...] | None = None,
+    note: Callable[[str], None] | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> Evaluation:
     """Play ``protocol.episodes`` episodes of each task with the agent and with the random policy.
 
     Deterministic for a protocol: an episode's environment and its random actions come from (seed, task, episode), and
-    ``protocol.num_envs`` episodes are played side by side. The groups are spread over all cores.
+    ``protocol.num_envs`` episodes are played side by side. The groups are spread over all cores if the suite's
+    environments may run in several threads (``TaskSuite.thread_safe``); others run in the calling thread only.
+
+    Args:
+        agent: who plays.
+        protocol: how.
+        tasks: names; None means all.
+        note: receives what the user should know meanwhile: episodes that do not end.
+        stop: asked at every step; the evaluation ends when it says so.
 
     Raises:
-        TaskError: a task is not one of the agent's.
+        TaskError: a task is not one of the agent's, or its environment fails.
+        EvaluationStopped: ``stop`` said so.
     """
     suite = agent.suite
     names = tasks or suite.names
@@ -159,21 +189,51 @@ def evaluate_agent(
         for first in range(0, protocol.episodes, protocol.num_envs)
     ]
 
+    def go_on() -> None:
+        work.check()
+        if stop is not None and stop():
+            raise EvaluationStopped
+
+    settings = Playing(protocol.seed, protocol.epsilon, protocol.max_episode_steps, note, go_on)
+
     def played(group: tuple[str, int, range]) -> list[EpisodeScore]:
         policy, task, numbers = group
         if policy == "random":
-            return play_episodes(policy, None, suite, task, numbers, protocol.seed, 1.0)
+            return play_episodes(policy, None, suite, task, numbers, replace(settings, epsilon=1.0))
         own = agent.independent()
-        reseed = own.reseed if own.draws else None
-        return play_episodes(policy, own.q_values, suite, task, numbers, protocol.seed, protocol.epsilon, reseed)
+        return play_episodes(
+            policy, own.q_values, suite, task, numbers, replace(settings, reseed=own.reseed if own.draws else None)
+        )
 
-    with all_cores() as pool:
-        episodes = [episode for group in pool.map(played, groups) for episode in group]
+    with parts(in_threads=suite.thread_safe) as work:
+        episodes = [episode for group in work.map(played, groups) for episode in group]
     rows = []
     for policy in ("agent", "random"):
         for name in names:
             rows.append(summarize(suite, [e for e in episodes if e.policy == policy and e.task == name]))
     return Evaluation(protocol, agent.step, tuple(rows), tuple(episodes))
+
+
+@dataclass(frozen=True)
+class Playing:
+    """How episodes are played.
+
+    Attributes:
+        seed: root of the episodes' seeds.
+        epsilon: share of random actions.
+        max_episode_steps: longer episodes are cut off.
+        note: receives what the user should know.
+        go_on: called before every step; what it raises ends the play.
+        reseed: of decisions that draw random numbers. They are then drawn anew from an episode's seed for each of its
+            decisions, so that an episode does not depend on those beside it; one decision is made after the other.
+    """
+
+    seed: int
+    epsilon: float
+    max_episode_steps: int = EvaluationConfig.max_episode_steps
+    note: Callable[[str], None] | None = None
+    go_on: Callable[[], None] | None = None
+    reseed: Callable[[int], None] | None = None
 
 
 def play_episodes(
@@ -182,9 +242,7 @@ def play_episodes(
     suite: TaskSuite,
     task: int,
     numbers: Sequence[int],
-    seed: int,
-    epsilon: float,
-    reseed: Callable[[int], None] | None = None,
+    playing: Playing,
 ) -> list[EpisodeScore]:
     """Play episodes of a task side by side with epsilon-greedy actions.
 
@@ -194,15 +252,11 @@ def play_episodes(
         suite: the tasks.
         task: index.
         numbers: of the episodes.
-        seed: root of the episodes' seeds.
-        epsilon: share of random actions.
-        reseed: of decisions that draw random numbers. They are then drawn anew from an episode's seed for each of its
-            decisions, so that an episode does not depend on those beside it; one decision is made after the other.
+        playing: seed, epsilon, and the longest episode.
     """
     play = Play(suite, task, len(numbers))
     try:
-        scores = _played(policy, q_function, suite, play, numbers, seed, epsilon, reseed)
-        return sorted(scores, key=lambda e: e.episode)
+        return sorted(_played(policy, q_function, suite, play, numbers, playing), key=lambda e: e.episode)
     finally:
         play.close()
 
@@ -213,27 +267,29 @@ def _played(
     suite: TaskSuite,
     play: Play,
     numbers: Sequence[int],
-    seed: int,
-    epsilon: float,
-    reseed: Callable[[int], None] | None,
+    playing: Playing,
 ) -> Iterator[EpisodeScore]:
     n, task = play.num_envs, play.task
     valid = np.flatnonzero(suite.valid_actions_KA[task])
-    rngs = [np.random.default_rng([seed, task, number]) for number in numbers]
-    seeds = np.asarray([episode_seed(seed, task, number) for number in numbers], np.int64)
+    rngs = [np.random.default_rng([playing.seed, task, number]) for number in numbers]
+    seeds = np.asarray([episode_seed(playing.seed, task, number) for number in numbers], np.int64)
     running, q_sums = np.ones(n, np.bool_), np.zeros(n)
     play.begin(np.arange(n), seeds)
     while running.any():
-        explore = np.asarray([rng.random() < epsilon for rng in rngs])
+        if playing.go_on is not None:
+            playing.go_on()
+        explore = np.asarray([rng.random() < playing.epsilon for rng in rngs])
         actions = np.asarray([valid[rng.integers(len(valid))] for rng in rngs], np.int64)
         if q_function is not None:
             asked = np.flatnonzero(running)
-            drawn = [(seed, task, int(numbers[int(env)]), int(play.lengths_steps[env])) for env in asked]
-            q_nA = _decided(q_function, play.observations[asked], task, drawn, reseed)
+            drawn = [(playing.seed, task, int(numbers[int(env)]), int(play.lengths_steps[env])) for env in asked]
+            q_nA = _decided(q_function, play.observations[asked], task, drawn, playing.reseed)
             q_sums[asked] += q_nA.max(axis=1)
             actions[asked] = np.where(explore[asked], actions[asked], q_nA.argmax(axis=1))
         played = play.step(actions)
-        for env in played.ended:
+        _announce(policy, suite.names[task], play.lengths_steps[running], playing)
+        cut = running & (play.lengths_steps >= playing.max_episode_steps)
+        for env in np.union1d(played.ended, np.flatnonzero(cut)):
             if running[env]:
                 length = int(play.lengths_steps[env])
                 yield EpisodeScore(
@@ -244,7 +300,7 @@ def _played(
                     score=float(play.returns[env]),
                     length_steps=length,
                     mean_q=None if q_function is None else float(q_sums[env]) / length,
-                    truncated=bool(played.truncated[env]) and not bool(played.terminated[env]),
+                    truncated=not bool(played.terminated[env]),
                 )
             running[env] = False
             # An idle copy starts its episode again, unobserved: environments must not be stepped past an end.
@@ -266,6 +322,16 @@ def _decided(
         reseed(int(np.random.default_rng(place).integers(2**62)))
         q_values.append(q_function(observation[None], task))
     return np.concatenate(q_values)
+
+
+def _announce(policy: str, task: str, lengths_steps: npt.NDArray[np.int64], playing: Playing) -> None:
+    """Say that an episode is long, once for the episodes that are played side by side."""
+    long = min(LONG_EPISODE_STEPS, playing.max_episode_steps)
+    if playing.note is not None and lengths_steps.max() == long:
+        rest = f"it is cut off after {playing.max_episode_steps:,} (evaluation.max_episode_steps)"
+        if long == playing.max_episode_steps:
+            rest = "it is cut off here (evaluation.max_episode_steps), with the return that it has"
+        playing.note(f"{task}: an episode of the {policy} policy has not ended after {long:,} steps; {rest}")
 
 
 def summarize(suite: TaskSuite, episodes: list[EpisodeScore]) -> TaskScore:

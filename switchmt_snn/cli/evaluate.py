@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +25,8 @@ class EvaluateOptions:
     """Seed of environments and random actions."""
     num_envs: int | None = None
     """Episodes played side by side."""
+    max_episode_steps: int | None = None
+    """Longer episodes are cut off."""
     task: str | None = None
     """Only this task."""
     checkpoint: Literal["last", "best"] = "last"
@@ -44,11 +47,11 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.viewing.tables import evaluation_table
 
     path = Path(run) if run is not None else latest_run()
-    names = ("episodes", "epsilon", "seed", "num_envs")
+    names = ("episodes", "epsilon", "seed", "num_envs", "max_episode_steps")
     protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     facts: dict[str, Any] = {}
     if options.runtime == "torch":
-        evaluation = evaluate(path, options.task, options.checkpoint, **protocol)
+        evaluation = evaluate(path, options.task, options.checkpoint, note=_say, **protocol)
     else:
         from switchmt_snn.export.export_run import evaluate_exported
 
@@ -64,3 +67,7 @@ def command(argv: list[str]) -> int:
     else:
         print(path / "evaluations")
     return 0
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -19,6 +19,8 @@ class EvaluationConfig:
     """Seed of the evaluation's environments and random actions; separate from training."""
     num_envs: int = 8
     """Episodes played side by side."""
+    max_episode_steps: int = 108_000
+    """An episode that has not ended after so many steps is cut off, with the return that it has."""
     every_steps: int | None = None
     """Also evaluate during training, every so many steps; null only at its end."""
     stop_at_returns: tuple[float, ...] = ()
@@ -31,6 +33,7 @@ class EvaluationConfig:
         require(0.0 <= self.epsilon <= 1.0, "evaluation.epsilon", self.epsilon, "a probability in [0, 1]")
         require(self.seed >= 0, "evaluation.seed", self.seed, "at least 0")
         require(self.num_envs >= 1, "evaluation.num_envs", self.num_envs, "at least 1")
+        require(self.max_episode_steps >= 1, "evaluation.max_episode_steps", self.max_episode_steps, "at least 1")
         require(self.every_steps is None or self.every_steps >= 1, "evaluation.every_steps", self.every_steps, ">= 1")
         if self.stop_at_returns:
             require(

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from switchmt_snn.acting.agent import Agent
-from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
+from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, EvaluationStopped, evaluate_agent
 from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, load_config, to_dict
 from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import TrainingFailed
@@ -31,6 +27,7 @@ from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run, latest_run
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.plan import decide, plan
+from switchmt_snn.runs.signals import stop_requests
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite, register_suite
 from switchmt_snn.tasks.suite import Suite
@@ -214,15 +211,17 @@ class _Driver:
             observer.start(training, self.folder, resumed_at)
         for text in notes:
             self._note(text)
-        stopped = False
         try:
-            with _stop_requests() as requested:
-                for event in () if self.solved else training.events():
+            with stop_requests() as requested:
+                if resumed_at is not None and self._owes_evaluation(resumed_at):
+                    self._evaluate_in_training(requested)
+                stopped = requested() and training.steps < self.config.total_steps
+                for event in () if self.solved or stopped else training.events():
                     logs(event)
                     for observer in self.observers:
                         observer(event)
                     if isinstance(event, Stepped):
-                        self._record(event.step)
+                        self._record(event.step, requested)
                         if self.solved:
                             self._note(f"evaluation.stop_at_returns is reached at step {event.step:,}: training ends")
                             break
@@ -257,17 +256,32 @@ class _Driver:
             )
         return loaded.log_sizes, loaded.step, notes
 
-    def _record(self, step: int) -> None:
+    def _record(self, step: int, requested: Callable[[], bool]) -> None:
         """Save and evaluate when a border of their periods was crossed by the last vector step."""
-        before = step - self.training.num_envs
-        every = self.config.evaluation.every_steps
-        if every is not None and step // every > before // every and step < self.config.total_steps:
+        if self._evaluates_at(step):
             self.training.reestimate_statistics()
-            evaluation = self._evaluate(self.config.evaluation)
-            self.solved = self._is_solved({row.task: row.mean for row in evaluation.tasks if row.policy == "agent"})
+            self._evaluate_in_training(requested)
+        before = step - self.training.num_envs
         every = self.config.recording.checkpoint_every_steps
         if step // every > before // every and step < self.config.total_steps and not self.solved:
             self._save()
+
+    def _evaluates_at(self, step: int) -> bool:
+        """Whether training is evaluated at a step."""
+        before, every = step - self.training.num_envs, self.config.evaluation.every_steps
+        return every is not None and step // every > before // every and step < self.config.total_steps
+
+    def _owes_evaluation(self, step: int) -> bool:
+        """Whether the evaluation of the step at which a run goes on was stopped."""
+        return self._evaluates_at(step) and not self.folder.mean_returns(step, self.config.evaluation)
+
+    def _evaluate_in_training(self, requested: Callable[[], bool]) -> None:
+        """Evaluate. A request to stop ends it; it is played again when the run goes on."""
+        try:
+            evaluation = self._evaluate(self.config.evaluation, requested)
+        except EvaluationStopped:
+            return
+        self.solved = self._is_solved({row.task: row.mean for row in evaluation.tasks if row.policy == "agent"})
 
     def _save(self) -> None:
         assert self.logs is not None
@@ -303,39 +317,18 @@ class _Driver:
         evaluation = self.config.evaluation
         return replace(evaluation, seed=evaluation.seed + 1) if self.solved else evaluation
 
-    def _evaluate(self, settings: EvaluationConfig) -> Evaluation:
+    def _evaluate(self, settings: EvaluationConfig, stop: Callable[[], bool] | None = None) -> Evaluation:
         training = self.training
         agent = Agent(training.learner.network, training.suite, self.config, training.learner.device, training.steps)
         protocol = EvaluationProtocol.of(settings, self.config.tasks)
         self._note(f"evaluating: {protocol}")
-        evaluation = evaluate_agent(agent, protocol)
+        evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop)
         self.folder.save_evaluation(evaluation)
         return evaluation
 
     def _note(self, text: str) -> None:
         for observer in self.observers:
             observer.note(text)
-
-
-@contextmanager
-def _stop_requests() -> Iterator[Callable[[], bool]]:
-    """Within it, the first SIGINT or SIGTERM only asks to stop at the next whole step; a second SIGINT interrupts."""
-    asked: list[int] = []
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        if asked and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked.append(number)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def load_agent(
@@ -371,6 +364,7 @@ def evaluate(
     task: str | None = None,
     checkpoint: str = "last",
     save: bool = True,
+    note: Callable[[str], None] | None = None,
     **protocol: Any,
 ) -> Evaluation:
     """Evaluate a run's agent and the random policy.
@@ -380,6 +374,7 @@ def evaluate(
         task: one task's name; None evaluates all.
         checkpoint: ``last`` or ``best``.
         save: write JSON and CSV to the run's ``evaluations/``.
+        note: receives what the user should know meanwhile: episodes that do not end.
         protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.
 
     Raises:
@@ -389,7 +384,7 @@ def evaluate(
     agent = load_agent(folder.path, checkpoint)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
-    evaluation = evaluate_agent(agent, EvaluationProtocol.of(settings, agent.config.tasks), tasks)
+    evaluation = evaluate_agent(agent, EvaluationProtocol.of(settings, agent.config.tasks), tasks, note)
     if save:
         folder.save_evaluation(evaluation)
     return evaluation

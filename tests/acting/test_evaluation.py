@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+import threading
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 
-from switchmt_snn.acting import evaluation
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import (
     DecisionMaker,
     EpisodeScore,
     EvaluationProtocol,
+    EvaluationStopped,
+    Playing,
     evaluate_agent,
     play_episodes,
     summarize,
@@ -31,10 +30,11 @@ from switchmt_snn.export.formats.files import nir_graphs
 from switchmt_snn.export.formats.onnx_writer import decision_model
 from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent
 from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.machine.cores import Parts, parts
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.atari import AtariSuite
 from switchmt_snn.tasks.registry import make_suite
-from switchmt_snn.tasks.suite import Reference
+from switchmt_snn.tasks.suite import Reference, TaskSuite
 from switchmt_snn.viewing.tables import published_rows
 from tests.conftest import CountingEnvironment, small_config, vector_suite
 
@@ -50,9 +50,16 @@ def minatar_agent(**network: str) -> Agent:
     return Agent(build_network(config.network, observation_spec(suite), 3), suite, config, torch.device("cpu"), 12)
 
 
+def small_agent(suite: TaskSuite) -> Agent:
+    config = small_config()
+    return Agent(build_network(config.network, observation_spec(suite), 3), suite, config, torch.device("cpu"), 12)
+
+
 def test_every_episode_is_played_once_with_its_own_seed() -> None:
     suite = vector_suite(lambda task, n: CountingEnvironment(task, n, 9), 4)
-    scores = play_episodes("agent", lambda x, task: np.tile([[0.0, 2.0]], (len(x), 1)), suite, 1, range(7), 10_000, 0.0)
+    scores = play_episodes(
+        "agent", lambda x, task: np.tile([[0.0, 2.0]], (len(x), 1)), suite, 1, range(7), Playing(10_000, 0.0)
+    )
     assert [score.episode for score in scores] == list(range(7))
     assert len({score.seed for score in scores}) == 7
     assert all(score.score == 45 and score.length_steps == 9 and score.mean_q == 2.0 for score in scores)
@@ -92,17 +99,12 @@ def test_deterministic_for_a_seed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("encoding", "engine"), [("direct", "fused"), ("rate", "fused"), ("direct", "snntorch")])
-def test_threads_play_what_one_after_the_other_plays(encoding: str, engine: str, monkeypatch) -> None:
+def test_threads_play_what_one_after_the_other_plays(encoding: str, engine: str) -> None:
     """snnTorch's neurons write into themselves and random encodings draw: neither is shared between threads."""
-
-    @contextmanager
-    def one_core() -> Iterator[ThreadPoolExecutor]:
-        with ThreadPoolExecutor(1) as pool:
-            yield pool
 
     agent = minatar_agent(encoding=encoding, neuron_engine=engine)
     threads = evaluate_agent(agent, PROTOCOL)
-    monkeypatch.setattr(evaluation, "all_cores", one_core)
+    agent.suite = replace(agent.suite, thread_safe=False)
     assert evaluate_agent(agent, PROTOCOL) == threads
 
 
@@ -149,6 +151,83 @@ def test_agent_acts_on_one_observation_and_on_batches() -> None:
         agent.q_values(batch[0], 2)
     with pytest.raises(TaskError, match="has shape"):
         agent.act(batch[0, 0], "asterix")
+
+
+def test_environments_of_other_people_are_played_in_the_calling_thread_only() -> None:
+    """Their state may be shared between copies: the same protocol gives the same scores."""
+    threads: set[int] = set()
+
+    class Watched(CountingEnvironment):
+        def step(self, actions):  # type: ignore[no-untyped-def]
+            threads.add(threading.get_ident())
+            return super().step(actions)
+
+    suite = vector_suite(lambda task, n: Watched(task, n, 9), 4)
+    agent = small_agent(suite)
+    evaluate_agent(agent, PROTOCOL)
+    assert threads == {threading.get_ident()}
+
+
+@pytest.mark.parametrize("name", ["GlobalRandom", "SampledActions"])
+def test_an_evaluation_repeats_itself_where_environments_draw_from_global_generators(name: str) -> None:
+    suite = make_suite(TasksConfig(suite="gym", names=(f"tests.tasks.odd_envs:{name}-v0",)))
+    agent = small_agent(suite)
+    one, two = (evaluate_agent(agent, PROTOCOL) for _ in range(2))
+    assert one == two
+    assert len({episode.score for episode in one.episodes if episode.policy == "random"}) == 7
+
+
+def test_an_episode_that_does_not_end_is_cut_off_and_announced() -> None:
+    suite = make_suite(TasksConfig(suite="gym", names=("tests.tasks.odd_envs:Endless-v0",)))
+    notes: list[str] = []
+    result = evaluate_agent(small_agent(suite), replace(PROTOCOL, max_episode_steps=40), note=notes.append)
+    assert {(e.length_steps, e.truncated) for e in result.episodes} == {(40, True)}
+    assert len(result.episodes) == 14
+    assert len(notes) == 6, "three groups of episodes for each of two policies"
+    assert notes[0].endswith(
+        "an episode of the agent policy has not ended after 40 steps; it is cut off here "
+        "(evaluation.max_episode_steps), with the return that it has"
+    )
+    assert "episodes of at most 40 steps" in str(result.protocol)
+
+
+@pytest.mark.parametrize("thread_safe", [False, True])
+def test_an_evaluation_stops_when_it_is_asked_to(thread_safe: bool) -> None:
+    suite = make_suite(TasksConfig(suite="gym", names=("tests.tasks.odd_envs:Endless-v0",)))
+    asked: list[int] = []
+    with pytest.raises(EvaluationStopped):
+        evaluate_agent(
+            small_agent(replace(suite, thread_safe=thread_safe)),
+            PROTOCOL,
+            stop=lambda: asked.append(1) or len(asked) > 20,  # type: ignore[func-returns-value]
+        )
+    assert len(asked) < 60
+
+
+@pytest.mark.parametrize("thread_safe", [False, True])
+def test_an_interrupt_ends_the_parts_that_are_running(thread_safe: bool) -> None:
+    """KeyboardInterrupt in the calling thread: endless parts end, or this test never does."""
+    started = threading.Event()
+
+    def part(number: int) -> None:
+        started.set()
+        if not thread_safe:
+            raise KeyboardInterrupt
+        while True:
+            work.check()
+
+    def interrupted() -> None:
+        nonlocal work
+        with parts(in_threads=thread_safe) as work:
+            results = work.map(part, range(50))
+            if thread_safe:
+                assert started.wait()
+                raise KeyboardInterrupt
+            list(results)
+
+    work = Parts(None)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
 
 
 def test_an_agent_acts_as_the_environment_counts_actions() -> None:

@@ -66,19 +66,19 @@ def test_the_evaluated_network_is_the_stored_one_also_after_crashes(
     evaluated: list[dict[str, torch.Tensor]] = []
     evaluate = runs.evaluate_agent
 
-    def watched(agent: Any, protocol: Any) -> Any:
+    def watched(agent: Any, protocol: Any, **others: Any) -> Any:
         evaluated.append({name: tensor.clone() for name, tensor in agent.network.state_dict().items()})
-        return evaluate(agent, protocol)
+        return evaluate(agent, protocol, **others)
 
     monkeypatch.setattr(runs, "evaluate_agent", watched)
     train(CONFIG, tmp_path / "whole")
     assert len(evaluated) == 4
     assert_equal(evaluated[-1], network_of(tmp_path / "whole"))
 
-    def failing(agent: Any, protocol: Any) -> Any:
+    def failing(agent: Any, protocol: Any, **others: Any) -> Any:
         if agent.step == 200:
             raise Crash
-        return evaluate(agent, protocol)
+        return evaluate(agent, protocol, **others)
 
     for step in (75, 130):  # each after an evaluation that no checkpoint holds
         with pytest.raises(Crash):
