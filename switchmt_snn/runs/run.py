@@ -273,7 +273,7 @@ class _Driver:
 
     def _owes_evaluation(self, step: int) -> bool:
         """Whether the evaluation of the step at which a run goes on was stopped."""
-        return self._evaluates_at(step) and not self.folder.mean_returns(step, self.config.evaluation)
+        return self._evaluates_at(step) and not self.folder.evaluations.mean_returns(step, self.config.evaluation)
 
     def _evaluate_in_training(self, requested: Callable[[], bool]) -> None:
         """Evaluate. A request to stop ends it; it is played again when the run goes on."""
