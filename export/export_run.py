@@ -62,6 +62,7 @@ class ExportSettings:
             ``nir``, every format that can express the network is written; ``ExportResult.left_out`` names the others.
         nir: one ``<task>.nir`` and ``<task>.json`` per task.
         tasks: also one ``decision_<task>.onnx`` for each of these.
+        unroll: also ``unrolled.onnx``: ``decision.onnx`` without Scan, for OpenVINO, tract and OpenCV.
         int8: store the weights as 8-bit integers with one step per output channel.
         nir_dialect: see ``switchmt_snn.export.formats.nir_writer``.
         parity_decisions: recorded decisions per task that the files are compared on.
@@ -70,6 +71,7 @@ class ExportSettings:
     onnx: bool = False
     nir: bool = False
     tasks: tuple[str, ...] = ()
+    unroll: bool = False
     int8: bool = False
     nir_dialect: NirDialect = "portable"
     parity_decisions: int = 1000
@@ -98,10 +100,9 @@ def export(
     settings = settings or ExportSettings()
     if settings.parity_decisions < 1:
         raise ConfigError(f"parity_decisions is {settings.parity_decisions}, expected at least 1")
-    if settings.tasks and settings.nir and not settings.onnx:
-        raise ConfigError(
-            "--task names a decision_TASK.onnx, expected --onnx with it (--nir writes every task); add --onnx"
-        )
+    if (settings.tasks or settings.unroll) and settings.nir and not settings.onnx:
+        option, file = ("--task", "decision_TASK.onnx") if settings.tasks else ("--unroll", "unrolled.onnx")
+        raise ConfigError(f"{option} writes {file}, expected --onnx with it (--nir writes every task); add --onnx")
     run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
@@ -162,7 +163,7 @@ def _built(network: FoldedNetwork, settings: ExportSettings, specialised: tuple[
     """Every model and graph, before anything is on the disk; if no format was asked for, those of every one that fits.
 
     Raises:
-        ExportError: a format that was asked for does not fit (one task's ONNX file asks for ONNX), or none does.
+        ExportError: a format that was asked for does not fit (an option of ONNX asks for ONNX), or none does.
     """
     chosen = settings.onnx or settings.nir
     models: dict[str, onnx.ModelProto] = {}
@@ -170,9 +171,9 @@ def _built(network: FoldedNetwork, settings: ExportSettings, specialised: tuple[
     left_out: dict[str, str] = {}
     if settings.onnx or not chosen:
         try:
-            models = onnx_models(network, specialised)
+            models = onnx_models(network, specialised, settings.unroll)
         except ExportError as error:
-            if chosen or specialised:
+            if chosen or specialised or settings.unroll:
                 raise
             left_out["onnx"] = str(error)
     if settings.nir or not chosen:
@@ -237,8 +238,10 @@ def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
     names = network.tasks
     graphs = {name: read_nir(files[key]) for name in names if (key := f"{file_name(name)}.nir") in files}
     own = {name: files[key].read_bytes() for name in names if (key := f"decision_{file_name(name)}.onnx") in files}
-    decision, step = (files[key].read_bytes() if key in files else None for key in ("decision.onnx", "step.onnx"))
-    return Exports(network, decision, step, graphs or None, own)
+    decision, step, unrolled = (
+        files[key].read_bytes() if key in files else None for key in ("decision.onnx", "step.onnx", "unrolled.onnx")
+    )
+    return Exports(network, decision, step, graphs or None, own, unrolled)
 
 
 def evaluate_exported(

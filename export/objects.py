@@ -31,18 +31,22 @@ Source = str | Path | Agent | QNetwork
 
 
 def to_onnx(
-    source: Source, kind: Literal["decision", "step"] = "decision", task: str | None = None, int8: bool = False
+    source: Source,
+    kind: Literal["decision", "step", "unrolled"] = "decision",
+    task: str | None = None,
+    int8: bool = False,
 ) -> onnx.ModelProto:
     """A network as an ONNX model; ``onnx.save(to_onnx(run), path)`` writes it.
 
     Args:
         source: see ``Source``.
-        kind: the whole decision, or one simulation step (``switchmt_snn.export.formats.onnx_writer``).
+        kind: the whole decision, one simulation step, or the decision without Scan
+            (``switchmt_snn.export.formats.onnx_writer``).
         task: fold this task in; None serves all tasks by an input.
         int8: store weights as 8-bit integers.
 
     Raises:
-        ExportError: an ANN has no step, or a weight is not finite.
+        ExportError: an ANN has no step and nothing to unroll, or a weight is not finite.
         TaskError: unknown task.
 
     Example:
@@ -53,11 +57,11 @@ def to_onnx(
     """
     network = _folded(source, int8)
     index = None if task is None else network.task_index(task)
-    if kind == "decision":
-        return decision_model(network, index)
+    if kind in ("decision", "unrolled"):
+        return decision_model(network, index, unroll=kind == "unrolled")
     if kind == "step":
         return step_model(network, index)
-    raise ExportError(f"kind is {kind!r}, expected decision or step")
+    raise ExportError(f"kind is {kind!r}, expected decision, step or unrolled")
 
 
 def to_nir(source: Source, task: str, dialect: NirDialect = "portable", int8: bool = False) -> nir.NIRGraph:

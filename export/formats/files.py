@@ -14,8 +14,10 @@ from switchmt_snn.runs.files import file_name
 from switchmt_snn.spiking.folding import FoldedNetwork
 
 
-def onnx_models(network: FoldedNetwork, specialised: tuple[str, ...] = ()) -> dict[str, onnx.ModelProto]:
-    """``decision``, ``step`` if the network spikes, and ``decision_<task>`` for some tasks, by file name.
+def onnx_models(
+    network: FoldedNetwork, specialised: tuple[str, ...] = (), unroll: bool = False
+) -> dict[str, onnx.ModelProto]:
+    """``decision``, ``step`` if the network spikes, ``decision_<task>`` for some tasks, ``unrolled``; by file name.
 
     Raises:
         ExportError: ONNX cannot express the network.
@@ -23,6 +25,8 @@ def onnx_models(network: FoldedNetwork, specialised: tuple[str, ...] = ()) -> di
     models = {"decision.onnx": decision_model(network)}
     if network.spiking:
         models["step.onnx"] = step_model(network)
+    if unroll:
+        models["unrolled.onnx"] = decision_model(network, unroll=True)
     for task in specialised:
         models[f"decision_{file_name(task)}.onnx"] = decision_model(network, network.task_index(task))
     return models

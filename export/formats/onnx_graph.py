@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 18
 """Operator set of the files (that of ONNX 1.13)."""
-FLOAT, INT64 = TensorProto.FLOAT, TensorProto.INT64
+FLOAT, INT32, INT64 = TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64
 TASK = "known_task"
 """The value that operators pick a task's numbers by: the input ``task``, made out of range where it is negative."""
 

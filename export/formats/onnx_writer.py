@@ -21,7 +21,7 @@ from onnx import helper, numpy_helper
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
 from switchmt_snn.export.formats.onnx_encodings import encode, observation_input
-from switchmt_snn.export.formats.onnx_graph import FLOAT, INT64, OPSET, TASK, Graph
+from switchmt_snn.export.formats.onnx_graph import FLOAT, INT32, INT64, OPSET, TASK, Graph
 from switchmt_snn.export.formats.onnx_nodes import Weights, export_neurons, export_synapses, weights_of
 from switchmt_snn.spiking.folding import FoldedNetwork
 
@@ -30,14 +30,28 @@ NEVER_CHOSEN = -(2.0**100)
 """``q_step`` of an action that the task does not have: finite, so that every readout is a number far below others."""
 
 
-def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.ModelProto:
+def decision_model(network: FoldedNetwork, task: int | None = None, unroll: bool = False) -> onnx.ModelProto:
     """The whole decision, for all tasks (input ``task`` int64 ``[B]``) or for one.
 
     Inputs are ``observation`` ``[B, *shape]``, raw (uint8 frames or float32 vectors; scaling and encoding are inside);
     with the random encoding ``rate`` it is ``encoded`` float32 ``[T, B, *shape]`` instead: the spikes that the host
     drew. Outputs are ``q_values`` ``[B, A]``, -inf where an action does not exist in the task, and for spiking networks
     ``spike_counts`` int64 ``[B, L]``: spikes of each neuron layer over T.
+
+    Args:
+        network: for all its tasks.
+        task: fold this one in; None takes it as an input.
+        unroll: the operators of a step T times one after the other, for runtimes without Scan; ``spike_counts`` are
+            then int32, as tract gives no int64 out.
+
+    Raises:
+        ExportError: a node without a rule, or nothing to unroll.
     """
+    if unroll and not network.spiking:
+        raise ExportError(
+            f"{network.settings.method} has no simulation steps, expected a spiking method to unroll; its "
+            "decision.onnx has no Scan"
+        )
     graph, network = Graph(), network if task is None else network.of_task(task)
     inputs = [observation_input(network)]
     if task is None:
@@ -46,8 +60,9 @@ def decision_model(network: FoldedNetwork, task: int | None = None) -> onnx.Mode
     encoded = encode(graph, network)
     outputs = [helper.make_tensor_value_info("q_values", FLOAT, ["batch", len(network.actions)])]
     if network.spiking:
-        q = _over_time(graph, network, weights, encoded)
-        outputs.append(helper.make_tensor_value_info("spike_counts", INT64, ["batch", len(network.layers)]))
+        q = _over_time(graph, network, weights, encoded, unroll)
+        counts = INT32 if unroll else INT64
+        outputs.append(helper.make_tensor_value_info("spike_counts", counts, ["batch", len(network.layers)]))
     else:
         x = encoded
         for layer in network.layers:
@@ -115,8 +130,8 @@ def _model(
     return model
 
 
-def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights], encoded: str) -> str:
-    """The Scan over T steps and the readout; returns Q ``[B, A]`` and defines ``spike_counts``."""
+def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights], encoded: str, unroll: bool) -> str:
+    """The T steps and the readout; returns Q ``[B, A]`` and defines ``spike_counts``."""
     layers, readout, timesteps = network.layers, network.readout, network.settings.timesteps
     if (
         network.constant_input
@@ -150,24 +165,57 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
         if readout.kind == "max_membrane":
             states["largest"] = network.head.output_shape
             body.add("Max", ["largest", "readout_next"], "largest_next")
-    _scan(graph, body, states, steps, batch_of, batch_axis)
-    graph.add("Cast", ["counts_final"], "spike_counts", to=INT64)
+    starts = _starts(graph, states, batch_of, batch_axis)
+    if unroll:
+        _unrolled(graph, body, starts, None if network.constant_input else encoded, timesteps)
+    else:
+        _scan(graph, body, states, starts, steps)
+    graph.add("Cast", ["counts_final"], "spike_counts", to=INT32 if unroll else INT64)
     if readout.kind != "mean":
         return "readout_final" if readout.kind == "last_membrane" else "largest_final"
     rate = graph.add("Div", ["spike_sum_final", graph.constant("timesteps", timesteps)], "mean_spikes")
     return export_synapses(graph, network.head, weights["head"], rate)
 
 
-def _scan(
-    graph: Graph, body: Graph, states: dict[str, tuple[int, ...]], steps: str, batch_of: str, batch_axis: int
-) -> None:
-    """Add the Scan: every state starts at zero (``largest`` at -inf) and ends as ``<state>_final``."""
+def _starts(graph: Graph, states: dict[str, tuple[int, ...]], batch_of: str, batch_axis: int) -> dict[str, str]:
+    """A start of each state for the batch of a value: zero, or of ``largest`` -inf."""
     shape = graph.add("Shape", [batch_of], "batch", start=batch_axis, end=batch_axis + 1)
-    starts = []
+    starts = {}
     for name, dims in states.items():
         full = graph.add("Concat", [shape, graph.constant(f"{name}_dims", dims, np.int64)], f"{name}_shape", axis=0)
         start = numpy_helper.from_array(np.asarray([-np.inf if name == "largest" else 0.0], np.float32))
-        starts.append(graph.add("ConstantOfShape", [full], f"{name}_start", value=start))
+        starts[name] = graph.add("ConstantOfShape", [full], f"{name}_start", value=start)
+    return starts
+
+
+def _unrolled(graph: Graph, body: Graph, starts: dict[str, str], encoded: str | None, timesteps: int) -> None:
+    """The operators of a step T times: each step's values have names of their own."""
+    inside = {name for node in body.nodes for name in node.output}
+    before = starts
+    for step in range(timesteps):
+        names = {name: f"step{step}/{name}" for name in inside} | before
+        if encoded is not None:
+            at = graph.constant(f"step{step}/index", step, np.int64)
+            names["encoded_step"] = graph.add("Gather", [encoded, at], f"step{step}/encoded", axis=0)
+        for node in body.nodes:
+            if any(attribute.HasField("g") or attribute.graphs for attribute in node.attribute):
+                raise ExportError(
+                    f"the operator {node.name} ({node.op_type}) has a graph of its own, expected none in a step that "
+                    "is unrolled; leave --unroll out"
+                )
+            copied = onnx.NodeProto()
+            copied.CopyFrom(node)
+            copied.name = f"step{step}/{node.name}"
+            for part in (copied.input, copied.output):
+                part[:] = [names.get(name, name) for name in part]
+            graph.nodes.append(copied)
+        before = {name: names[f"{name}_next"] for name in starts}
+    for name, last in before.items():
+        graph.add("Identity", [last], f"{name}_final")
+
+
+def _scan(graph: Graph, body: Graph, states: dict[str, tuple[int, ...]], starts: dict[str, str], steps: str) -> None:
+    """Add the Scan: every state ends as ``<state>_final``."""
     step_dtype = INT64 if steps == "steps" else FLOAT
     values = {name: [None, *dims] for name, dims in states.items()}
     proto = helper.make_graph(
@@ -179,7 +227,7 @@ def _scan(
     )
     finals = [f"{name}_final" for name in states]
     graph.nodes.append(
-        helper.make_node("Scan", [*starts, steps], finals, name="simulation", body=proto, num_scan_inputs=1)
+        helper.make_node("Scan", [*starts.values(), steps], finals, name="simulation", body=proto, num_scan_inputs=1)
     )
 
 

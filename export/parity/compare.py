@@ -190,6 +190,7 @@ class Exports:
     graphs: dict[str, nir.NIRGraph] | None = None
     own_decisions: dict[str, bytes] = field(default_factory=dict)
     """``decision_<task>.onnx`` by task."""
+    unrolled: bytes | None = None
 
 
 def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray[Any]) -> list[Comparison]:
@@ -199,9 +200,17 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
     """
     name, network = agent.suite.names[task], exports.network
     own = OnnxAgent(exports.own_decisions[name], agent.suite, agent.config) if name in exports.own_decisions else None
-    there = {"onnx": exports.decision, "onnx, one task": own, "nir": exports.graphs}
+    there = {
+        "onnx": exports.decision,
+        "onnx, unrolled": exports.unrolled,
+        "onnx, one task": own,
+        "nir": exports.graphs,
+    }
     runtimes = [runtime for runtime, model in there.items() if model is not None]
-    decision = OnnxAgent(exports.decision, agent.suite, agent.config) if exports.decision is not None else None
+    decision, unrolled = (
+        OnnxAgent(model, agent.suite, agent.config) if model is not None else None
+        for model in (exports.decision, exports.unrolled)
+    )
     step = onnx_session(exports.step) if exports.step is not None else None
 
     def compared(seed: int, chunk: npt.NDArray[Any]) -> list[Comparison]:
@@ -213,6 +222,8 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
         for result in results:
             if result.runtime == "onnx" and decision is not None:
                 result.add(expected, trace_onnx(network, decision, step, chunk, encoded_TB, task))
+            elif result.runtime == "onnx, unrolled" and unrolled is not None:
+                result.add(expected, trace_onnx(network, unrolled, None, chunk, encoded_TB, task))
             elif result.runtime == "onnx, one task" and own is not None:
                 result.add(expected, trace_onnx(network, own, None, chunk, encoded_TB, task))
             elif exports.graphs is not None:

@@ -127,6 +127,7 @@ class _Proof:
             step_model(network).SerializeToString() if written.step is not None else None,
             graphs,
             {name: decision_model(network, names.index(name)).SerializeToString() for name in written.own_decisions},
+            decision_model(network, unroll=True).SerializeToString() if written.unrolled is not None else None,
         )
 
     def _stored_integers(self, decision: bytes, task: int, recorded: Observations) -> dict[str, Any]:

@@ -23,6 +23,8 @@ class ExportOptions:
     """One NIR graph and one JSON file per task."""
     task: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Also decision_TASK.onnx for this task alone. May be repeated."""
+    unroll: bool = False
+    """Also unrolled.onnx: decision.onnx with its steps one after the other, for OpenVINO, tract and OpenCV."""
     int8: bool = False
     """Weights as 8-bit integers, symmetric per output channel. The effect on decisions is measured."""
     nir_dialect: Literal["portable", "spikingjelly", "exact", "legacy"] = "portable"
@@ -49,6 +51,7 @@ def command(argv: list[str]) -> int:
         onnx=options.onnx,
         nir=options.nir,
         tasks=options.task,
+        unroll=options.unroll,
         int8=options.int8,
         nir_dialect=options.nir_dialect,
         parity_decisions=options.parity_decisions,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import subprocess
@@ -98,6 +99,22 @@ def test_programs_for_other_simulators(name: str, neuron: str, dialect: str, tmp
     assert done.returncode == 0, done.stderr
     expected, _ = NirInterpreter(graph, **simulator.interpreter).run(encode(agent.suite, agent.config, x, 0))
     assert json.loads(done.stdout.splitlines()[-1]) == expected.mean(0)[0].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "module"), [("openvino", "openvino"), ("tract", "tract"), ("opencv", "cv2")])
+def test_programs_for_runtimes_without_scan(name: str, module: str, tmp_path: Path) -> None:
+    if importlib.util.find_spec(module) is None:
+        pytest.skip(f"{module} is not installed")
+    agent = dyadic_copy(make_agent(seed=2))
+    x = dyadic_observations(observations(agent, 1, seed=3))
+    write_atomically(tmp_path / "unrolled.onnx", decision_model(fold_agent(agent), unroll=True).SerializeToString())
+    np.save(tmp_path / "observation.npy", x[0])
+    (tmp_path / "program.py").write_text(programs()[f"{name}_q.py"])
+    command = [sys.executable, "program.py", "unrolled.onnx", "observation.npy", "1"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == agent.q_values(x, 1)[0].tolist()
 
 
 @pytest.mark.slow
