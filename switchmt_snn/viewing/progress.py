@@ -41,7 +41,7 @@ class Progress:
         """Greet, and open the live table if there is a terminal."""
         self._training = training
         self._returns: list[deque[float]] = [deque(maxlen=RETURN_WINDOW_EPISODES) for _ in training.suite.names]
-        self._started, self._first_step = time.monotonic(), training.steps
+        self._speed = Speed(time.monotonic(), training.steps)
         config = training.config
         network, skip = config.network, suite_of(config.tasks).frame_skip
         where = f"continuing {folder.path} at step {resumed_at:,}" if resumed_at is not None else f"run {folder.path}"
@@ -94,12 +94,10 @@ class Progress:
             self._print_line()
 
     def _rate(self) -> tuple[float, str]:
-        """Steps per second of this call, and the time left."""
+        """Steps per second lately, and the time left."""
         training = self._training
-        made, spent = training.steps - self._first_step, time.monotonic() - self._started
-        rate = made / spent if spent > 0 else 0.0
-        left = (training.config.total_steps - training.steps) / rate if rate else 0.0
-        return rate, time.strftime("%H:%M:%S", time.gmtime(max(0.0, left)))
+        rate = self._speed.per_second(time.monotonic(), training.steps)
+        return rate, duration((training.config.total_steps - training.steps) / rate) if rate else "-"
 
     def _print_line(self) -> None:
         training = self._training
@@ -153,6 +151,39 @@ class Progress:
             f"updates {training.learner.updates:,}{self._learning()}"
         )
         return Group(table, status, *(Text(line, style="yellow") for line in self._health()))
+
+
+class Speed:
+    """Steps per second over the newer half of the time since the start, at most ten minutes.
+
+    A run is faster while its replays fill than afterwards; an average since the start would be wrong for hours.
+    """
+
+    LONGEST_S = 600.0
+
+    def __init__(self, now_s: float, steps: int) -> None:
+        self._started_s = now_s
+        self._seen = deque([(now_s, steps)])
+
+    def per_second(self, now_s: float, steps: int) -> float:
+        """The speed at a moment, which becomes one of those that later ones are measured from; 0 at first."""
+        oldest_s = now_s - min(self.LONGEST_S, (now_s - self._started_s) / 2)
+        while len(self._seen) > 1 and self._seen[1][0] <= oldest_s:
+            self._seen.popleft()
+        then_s, before = self._seen[0]
+        self._seen.append((now_s, steps))
+        return (steps - before) / (now_s - then_s) if now_s > then_s else 0.0
+
+
+def duration(seconds: float) -> str:
+    """Hours, minutes and seconds; days in front if there are any.
+
+    >>> duration(3_725.4), duration(428_400)
+    ('01:02:05', '4 d 23:00:00')
+    """
+    days, rest = divmod(max(0, int(seconds)), 86_400)
+    clock = f"{rest // 3600:02}:{rest // 60 % 60:02}:{rest % 60:02}"
+    return f"{days} d {clock}" if days else clock
 
 
 def _mean(values: deque[float]) -> str:
