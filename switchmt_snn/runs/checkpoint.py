@@ -50,6 +50,21 @@ class LoadedCheckpoint:
     damaged: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Best:
+    """The best weights of a run.
+
+    Attributes:
+        step: agent steps of the run.
+        score: by which they were chosen (``switchmt_snn.runs.best``).
+        judged_by: ``evaluation`` or ``returns``, of training; scores of one kind cannot be compared with the other's.
+    """
+
+    step: int
+    score: float
+    judged_by: str
+
+
 @contextmanager
 def fitting_weights() -> Iterator[None]:
     """Within it, weights that do not fit the network's parameters are an error of one line.
@@ -112,7 +127,7 @@ class CheckpointStore:
         self._remove_old()
         return final
 
-    def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float) -> None:
+    def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float, judged_by: str) -> None:
         """Keep these weights as the best so far (weights only)."""
         temporary, final = self.folder / ".best.tmp", self.folder / "best"
         shutil.rmtree(temporary, ignore_errors=True)
@@ -120,19 +135,21 @@ class CheckpointStore:
         try:
             model = {name: tensor.detach().cpu().contiguous() for name, tensor in network_state.items()}
             files = {"model.safetensors": safetensors.torch.save(model)}
-            self._write_folder(temporary, files, {"step": step, "score": score, "segments": [], "logs": {}})
+            facts = {"step": step, "score": score, "judged_by": judged_by, "segments": [], "logs": {}}
+            self._write_folder(temporary, files, facts)
             shutil.rmtree(final, ignore_errors=True)
             temporary.rename(final)
         except OSError:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
 
-    def best_score(self) -> float | None:
-        """Score of the best weights, if there are any."""
+    def best(self) -> Best | None:
+        """What is known of the best weights; None if there are none."""
         try:
-            return float(_read_manifest(self.folder / "best")["score"])
+            manifest = _read_manifest(self.folder / "best")
         except CheckpointError:
             return None
+        return Best(int(manifest["step"]), float(manifest["score"]), manifest.get("judged_by", "returns"))
 
     def _write_folder(self, folder: Path, files: dict[str, bytes], facts: dict[str, Any]) -> None:
         for name, content in files.items():

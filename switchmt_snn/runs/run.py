@@ -21,6 +21,7 @@ from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
+from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.environment import describe_environment
@@ -32,9 +33,6 @@ from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite, register_suite
 from switchmt_snn.tasks.suite import Suite
 from switchmt_snn.updates.processes import ProcessGroup, join_processes
-
-BEST_WINDOW_EPISODES = 20
-"""The best checkpoint has the largest mean rise of the newest 20 training returns over a task's first 20."""
 
 
 class Observer(Protocol):
@@ -183,6 +181,7 @@ class _Driver:
         self.folder, self.training, self.observers = folder, training, observers
         self.config = training.config
         self.store = folder.checkpoints(self.config.recording.keep_checkpoints)
+        self.best = BestWeights(folder, self.config.evaluation, training.suite.names)
         self.logs: RunLogs | None = None
         self.solved = False
 
@@ -288,21 +287,7 @@ class _Driver:
         training = self.training
         training.check_finite()
         self.store.save(training.steps, training.state_dict(), training.replays, self.logs.sync())
-        score = self._rise()
-        best = self.store.best_score()
-        if score is not None and (best is None or score > best):
-            self.store.save_best(training.steps, training.with_fresh_statistics().state_dict(), score)
-
-    def _rise(self) -> float | None:
-        """Mean over tasks of (newest returns - first returns) / spread of the first; None while episodes are few."""
-        returns = self.folder.initial_and_recent_returns(BEST_WINDOW_EPISODES)
-        rises = []
-        for name in self.training.suite.names:
-            first, newest = returns.get(name, ([], []))
-            if len(first) < BEST_WINDOW_EPISODES:
-                return None
-            rises.append((np.mean(newest) - np.mean(first)) / max(1.0, float(np.std(first))))
-        return float(np.mean(rises))
+        self.best.at_checkpoint(training.steps, training.with_fresh_statistics)
 
     def _is_solved(self, means: dict[str, float]) -> bool:
         """Whether an evaluation's mean returns by task reach ``evaluation.stop_at_returns``."""
@@ -324,6 +309,7 @@ class _Driver:
         self._note(f"evaluating: {protocol}")
         evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop)
         self.folder.save_evaluation(evaluation)
+        self.best.at_evaluation(evaluation, agent.network)
         return evaluation
 
     def _note(self, text: str) -> None:

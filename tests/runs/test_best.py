@@ -1,0 +1,94 @@
+"""The best weights: by the evaluations during training if there are any, else by training returns; named at the end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from switchmt_snn import evaluate, train
+from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, summarize
+from switchmt_snn.cli import main
+from switchmt_snn.config import EvaluationConfig
+from switchmt_snn.config.yaml_io import from_dict, to_yaml
+from switchmt_snn.runs.best import rise_above_random
+from switchmt_snn.runs.checkpoint import Best, CheckpointStore
+from switchmt_snn.runs.evaluations import Evaluations
+
+CARTPOLE: dict[str, Any] = {
+    "total_steps": 600,
+    "threads": 1,
+    "tasks": {"suite": "gym", "names": ["CartPole-v1"]},
+    "network": {"hidden_units": 8, "timesteps": 2},
+    "learning": {"batch_size": 8, "learning_starts_steps": 20, "replay_capacity_steps": 600, "learning_rate": 0.01},
+    "recording": {"checkpoint_every_steps": 200},
+}
+
+
+def test_with_evaluations_the_best_weights_are_those_of_the_best_one(tmp_path: Path) -> None:
+    """Also between checkpoints, and the last one counts."""
+    config = from_dict({**CARTPOLE, "evaluation": {"episodes": 5, "epsilon": 0.0, "every_steps": 70}})
+    train(config, tmp_path / "run")
+    scores = {
+        step: Evaluations(tmp_path / "run" / "evaluations").mean_returns(step, config.evaluation)["CartPole-v1"]
+        for step in [*range(70, 600, 70), 600]
+    }
+    best = CheckpointStore(tmp_path / "run" / "checkpoints").best()
+    assert best is not None
+    assert best.judged_by == "evaluation"
+    assert scores[best.step] == max(scores.values())
+    again = evaluate(tmp_path / "run", checkpoint="best", save=False)
+    assert again.score("CartPole-v1").mean == max(scores.values())
+
+
+def test_without_evaluations_they_are_chosen_by_training_returns(tmp_path: Path) -> None:
+    train(from_dict({**CARTPOLE, "evaluation": {"episodes": 1}}), tmp_path / "run")
+    best = CheckpointStore(tmp_path / "run" / "checkpoints").best()
+    assert best is not None
+    assert (best.judged_by, best.step % 200) == ("returns", 0)
+
+
+def test_a_score_of_another_kind_is_not_compared(tmp_path: Path) -> None:
+    """A run of an older version kept its best by returns; the first evaluation replaces it."""
+    store = CheckpointStore(tmp_path)
+    store.save_best(10, {"w": torch.ones(1)}, 99.0, "returns")
+    manifest = json.loads((tmp_path / "best" / "manifest.json").read_text())
+    assert manifest["judged_by"] == "returns"
+    assert store.best() == Best(10, 99.0, "returns")
+    assert load_file(tmp_path / "best" / "model.safetensors")["w"] == 1
+
+
+def test_the_score_of_an_evaluation_is_the_rise_above_random_play() -> None:
+    from switchmt_snn.acting.evaluation import EpisodeScore
+    from switchmt_snn.tasks.registry import make_suite
+
+    suite = make_suite(from_dict(CARTPOLE).tasks)
+    scores = {"agent": [110.0, 130.0], "random": [10.0, 30.0]}
+    episodes = [
+        EpisodeScore(policy, "CartPole-v1", number, 0, value, 9, None, False)
+        for policy, values in scores.items()
+        for number, value in enumerate(values)
+    ]
+    rows = tuple(summarize(suite, [one for one in episodes if one.policy == policy]) for policy in scores)
+    protocol = EvaluationProtocol.of(EvaluationConfig(), from_dict(CARTPOLE).tasks)
+    assert rise_above_random(Evaluation(protocol, 1, rows, tuple(episodes))) == pytest.approx((120 - 20) / 10)
+
+
+def test_the_end_of_a_run_names_its_best_weights(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = from_dict({**CARTPOLE, "evaluation": {"episodes": 2, "every_steps": 100}})
+    (tmp_path / "c.yaml").write_text(to_yaml(config))
+    with pytest.raises(SystemExit) as stop:
+        main(["train", str(tmp_path / "c.yaml"), "--run", str(tmp_path / "a run")])
+    out = capsys.readouterr().out
+    assert stop.value.code == 0
+    best = CheckpointStore(tmp_path / "a run" / "checkpoints").best()
+    assert best is not None
+    named = f"The best weights by the evaluations during training are those of step {best.step:,} (--checkpoint best)."
+    assert (named in out) == (best.step != 600)
+    assert f"describe '{tmp_path / 'a run' / 'config.yaml'}'" in out
+    following = [line.strip() for line in out.split("Next:\n")[1].splitlines()[:-1]]
+    assert len(following) >= 5
