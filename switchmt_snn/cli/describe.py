@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
-from switchmt_snn.cli.parsing import leading_name, parse
-from switchmt_snn.config import ExperimentConfig, load_config, resolve
+from switchmt_snn.cli.parsing import parse, split_one
+from switchmt_snn.config import ExperimentConfig, load_config
 from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -24,21 +24,21 @@ class DescribeOptions:
 
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
-    source, rest = leading_name(argv)
-    # The paper's settings give the paper's table; a config of one's own gives its own.
-    default = load_config(source or "paper")
+    flagless = DescribeOptions(experiment=ExperimentConfig())
+    source, rest = split_one(DescribeOptions, argv, "describe", flagless)
+    default = load_config(source or "quickstart")
     options = parse(DescribeOptions, rest, "describe", DescribeOptions(experiment=default))
     from switchmt_snn.machine.memory import available_bytes
     from switchmt_snn.runs.description import describe
     from switchmt_snn.viewing.tables import layers_table, methods_table
 
-    config = resolve(options.experiment)
+    config, source = options.experiment, source or "quickstart"
     methods = describe(config)
     if options.json:
-        facts: dict[str, Any] = {"config": config.name, "available_memory_bytes": available_bytes()}
+        facts: dict[str, Any] = {"config": config.name, "source": source, "available_memory_bytes": available_bytes()}
         print(json_text({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}}))
         return 0
-    console = Console()
-    console.print(methods_table(methods))
+    console = output.console()
+    console.print(methods_table(methods, source))
     console.print(layers_table(methods[config.network.method]))
     return 0

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from switchmt_snn import __version__
 from switchmt_snn.cli import describe, doctor, evaluate, export, profile, train
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
+from switchmt_snn.machine.program import runnable
+from switchmt_snn.viewing.output import speak_any_encoding
 
 USAGE = """\
 usage: switchmt-snn COMMAND [options]
@@ -35,6 +37,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``switchmt-snn``; exits with a code that USAGE lists."""
+    speak_any_encoding()
     sys.exit(_main(sys.argv[1:] if argv is None else argv))
 
 
@@ -50,7 +53,7 @@ def _main(argv: list[str]) -> int:
             raise ConfigError(f"unknown command {argv[0]!r}{did_you_mean(argv[0], COMMANDS)}")
         return COMMANDS[argv[0]](argv[1:])
     except SwitchMTError as error:
-        print(f"switchmt-snn: {error}", file=sys.stderr)
+        print(f"switchmt-snn: {runnable(str(error))}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("switchmt-snn: interrupted", file=sys.stderr)

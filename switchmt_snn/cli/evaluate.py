@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.console import Console
-
-from switchmt_snn.cli.parsing import leading_name, parse
+from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class EvaluateOptions:
 
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
-    run, rest = leading_name(argv)
+    run, rest = split_one(EvaluateOptions, argv, "evaluate", EvaluateOptions())
     options = parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
     from switchmt_snn.runs.folder import latest_run
     from switchmt_snn.runs.run import evaluate
@@ -60,7 +59,7 @@ def command(argv: list[str]) -> int:
     if options.json:
         print(json_text({"run": str(path), **facts, **evaluation.to_dict()}))
         return 0
-    Console().print(evaluation_table(evaluation))
+    output.console().print(evaluation_table(evaluation))
     if facts:
         print(f"played by {options.runtime}; {share:.2%} of its decisions are those of the trained network")
         print(path / "export" / "evaluations")

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from rich.console import Console
 
-from switchmt_snn.cli.parsing import leading_name, parse
+from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ExportOptions:
 
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
-    run, rest = leading_name(argv)
+    run, rest = split_one(ExportOptions, argv, "export", ExportOptions())
     options = parse(ExportOptions, rest, "export", ExportOptions())
     from switchmt_snn.export.export_run import ExportSettings, export
     from switchmt_snn.viewing.tables import parity_table
@@ -56,7 +56,7 @@ def command(argv: list[str]) -> int:
         nir_dialect=options.nir_dialect,
         parity_decisions=options.parity_decisions,
     )
-    console = Console(stderr=options.json)
+    console = output.console(stderr=options.json)
     result = export(
         Path(run) if run is not None else None,
         settings,

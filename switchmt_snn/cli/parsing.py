@@ -1,4 +1,4 @@
-"""From words of a command line to options: the positional arguments first, then flags over a default."""
+"""From words of a command line to options: the positional arguments wherever they stand, and flags over a default."""
 
 from __future__ import annotations
 
@@ -7,19 +7,95 @@ import io
 from typing import Any
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from switchmt_snn.config import presets
+from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
 
+ARGUMENTS = {
+    "train": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
+    "describe": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
+    "evaluate": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
+    "export": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
+    "profile": ("RUN", "run folders, or NIR files (default: the run under runs/ that was begun last)"),
+    "doctor": ("", ""),
+}
+"""The positional argument of each command, and what it is."""
 
-def leading_names(argv: list[str]) -> tuple[list[str], list[str]]:
-    """The positional arguments, which come first, and the rest."""
-    count = next((index for index, word in enumerate(argv) if word.startswith("-")), len(argv))
-    return argv[:count], argv[count:]
+_REGISTRY = ConstructorRegistry()
 
 
-def leading_name(argv: list[str]) -> tuple[str | None, list[str]]:
-    """The positional argument, which comes first, or None, and the rest."""
-    return (argv[0], argv[1:]) if argv and not argv[0].startswith("-") else (None, argv)
+@_REGISTRY.primitive_rule
+def _whole_numbers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+    """Whole numbers as people write them: 1e6 is one."""
+    if info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda words: whole_number(words[0]),
+        is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def split(kind: Any, argv: list[str], command: str, default: Any) -> tuple[list[str], list[str]]:
+    """The positional arguments, wherever they stand, and the flags with their values.
+
+    A word is positional if no flag takes it. A flag that takes a list takes every word up to the next flag, and so does
+    a flag that the command does not have: the parser then names it.
+    """
+    parser = tyro.extras.get_parser(kind, default=default, registry=_REGISTRY)
+    takes = {flag: action.nargs for action in parser._actions for flag in action.option_strings}
+    names: list[str] = []
+    flags: list[str] = []
+    open_values: float = 0  # words that the last flag still takes
+    for word in argv:
+        if word.startswith("--") or word == "-h":
+            flag, equals, _ = word.partition("=")
+            flag = RENAMED.get(command, {}).get(flag, flag).replace("_", "-")
+            nargs = takes.get(flag, "*")
+            open_values = 0 if equals else 1 if nargs is None else nargs if isinstance(nargs, int) else float("inf")
+            flags.append(word)
+        elif open_values > 0:
+            open_values -= 1
+            flags.append(word)
+        else:
+            names.append(word)
+    return names, flags
+
+
+def split_one(kind: Any, argv: list[str], command: str, default: Any) -> tuple[str | None, list[str]]:
+    """As ``split``, for a command with one positional argument; None if it is left out.
+
+    Raises:
+        ConfigError: there are several.
+    """
+    names, flags = split(kind, argv, command, default)
+    if len(names) > 1:
+        argument = ARGUMENTS[command][0]
+        raise ConfigError(
+            f"{command} got {' '.join(names)}, expected one {argument}; see switchmt-snn {command} --help"
+        )
+    return names[0] if names else None, flags
+
+
+def _shown(command: str) -> str:
+    """The argument in the line of usage."""
+    name = ARGUMENTS[command][0]
+    return f" [{name}]" if name else ""
+
+
+def _description(kind: Any, command: str) -> str:
+    """The help's first paragraphs: what the command does, and what its argument is."""
+    name, meaning = ARGUMENTS[command]
+    lines = [" ".join((kind.__doc__ or "").split())]
+    if name:
+        lines += ["", f"{name}: {meaning}"]
+    if name == "CONFIG":
+        lines += [f"  {preset:<11} {text}" for preset, text in presets().items()]
+    return "\n".join(lines)
 
 
 def peek(argv: list[str], flag: str) -> str | None:
@@ -46,7 +122,14 @@ def parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, default=default, args=argv, prog=f"switchmt-snn {command}")
+            return tyro.cli(
+                kind,
+                default=default,
+                args=argv,
+                prog=f"switchmt-snn {command}{_shown(command)}",
+                description=_description(kind, command),
+                registry=_REGISTRY,
+            )
     except SystemExit as stop:
         if stop.code == 0:
             raise

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import tyro
-from rich.console import Console
 
-from switchmt_snn.cli.parsing import leading_names, parse
+from switchmt_snn.cli.parsing import parse, split
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ProfileOptions:
 
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
-    names, rest = leading_names(argv)
+    names, rest = split(ProfileOptions, argv, "profile", ProfileOptions())
     options = parse(ProfileOptions, rest, "profile", ProfileOptions())
     from switchmt_snn.export import ProfileResult, compare_profiles, profile, profile_file
     from switchmt_snn.runs.folder import RunFolder
@@ -80,7 +80,7 @@ def command(argv: list[str]) -> int:
     if len(profiles) > 1:
         report = compare_profiles(profiles, options.out)
     if options.json:
-        print(json_text(profiles[0].facts) if len(profiles) == 1 else report.with_suffix(".json").read_text())
+        print(json_text(profiles[0].facts) if len(profiles) == 1 else report.with_suffix(".json").read_text("utf-8"))
         return 0
     _print_profiles([one.facts for one in profiles])
     print(report)
@@ -90,7 +90,7 @@ def command(argv: list[str]) -> int:
 def _print_profiles(profiles: list[dict[str, Any]]) -> None:
     from switchmt_snn.viewing.tables import comparison_table, energy_table, fit_table, profile_table
 
-    console = Console(markup=False)  # names may hold brackets
+    console = output.console()
     if len(profiles) > 1:
         console.print(comparison_table(profiles))
     for facts in profiles:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +10,11 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from switchmt_snn.cli.parsing import leading_name, parse, peek
+from switchmt_snn.cli.parsing import parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
+from switchmt_snn.machine.program import program, runnable
 from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class TrainOptions:
 
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
-    source, rest = leading_name(argv)
+    source, rest = split_one(TrainOptions, argv, "train", TrainOptions(experiment=ExperimentConfig()))
     run = peek(rest, "--run")
     default = _starting_config(source, run)
     options = parse(TrainOptions, rest, "train", TrainOptions(experiment=default))
@@ -42,7 +45,7 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.viewing.tables import evaluation_table
     from switchmt_snn.viewing.tensorboard import TensorBoard
 
-    console = Console(stderr=options.json)
+    console = output.console(stderr=options.json)
     observers: list[Observer] = [Progress(console)]
     if config.recording.tensorboard:
         observers.append(TensorBoard())
@@ -52,7 +55,7 @@ def command(argv: list[str]) -> int:
     if options.json:
         scores = None if result.evaluation is None else result.evaluation.to_dict()
         print(json_text({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores}))
-    again = f"switchmt-snn train --run {result.path}"
+    again = f"{program()} train --run {shlex.quote(str(result.path))}"
     if result.status == "stopped":
         console.print(f"stopped at step {result.step:,}; continue exactly here with: {again}", soft_wrap=True)
     elif result.status == "already_finished":
@@ -63,13 +66,14 @@ def command(argv: list[str]) -> int:
         )
     elif result.evaluation is not None:
         console.print(evaluation_table(result.evaluation))
-        _say_what_next(console, config, result.path)
+        _say_what_next(console, config, result.path, result.step)
     if not options.json:
         print(result.path)
     return 130 if result.status == "stopped" else 0
 
 
-def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> None:
+def _say_what_next(console: Console, config: ExperimentConfig, path: Path, step: int) -> None:
+    from switchmt_snn.runs.folder import RunFolder
     from switchmt_snn.tasks.registry import find_suite
 
     lines = []
@@ -80,16 +84,21 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path) -> No
             "learns: 'switchmt-snn train cartpole' (a minute), 'switchmt-snn train minatar' on a CPU (about 20 "
             "minutes; scores: results/minatar/README.md; extra: minatar); 'switchmt-snn train paper' is for a GPU."
         )
+    run, best = shlex.quote(str(path)), RunFolder(path).checkpoints().best()
+    if best is not None and best.step != step:
+        judged = {"evaluation": "the evaluations during training", "returns": "the returns of training"}[best.judged_by]
+        lines.append(f"The best weights by {judged} are those of step {best.step:,} (--checkpoint best).")
     lines += [
         "Next:",
-        f"  switchmt-snn evaluate {path} --episodes 30",
-        f"  switchmt-snn export {path}",
-        f"  switchmt-snn profile {path}",
-        f"  switchmt-snn train --run {path} --total-steps {2 * config.total_steps}",
-        "  switchmt-snn describe",
+        f"  switchmt-snn evaluate {run} --episodes 30",
+        *([f"  switchmt-snn evaluate {run} --episodes 30 --checkpoint best"] if best and best.step != step else []),
+        f"  switchmt-snn export {run}",
+        f"  switchmt-snn profile {run}",
+        f"  switchmt-snn train --run {run} --total-steps {2 * config.total_steps}",
+        f"  switchmt-snn describe {shlex.quote(str(path / 'config.yaml'))}",
     ]
     for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(runnable(line), highlight=False, soft_wrap=True)
 
 
 def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:

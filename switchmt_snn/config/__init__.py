@@ -13,7 +13,7 @@ from switchmt_snn.config.plugins import PluginName
 from switchmt_snn.config.suites import SuiteDefaults
 from switchmt_snn.config.switching import POLICIES, Policy, SwitchingConfig
 from switchmt_snn.config.tasks import TasksConfig, resolved_frame_stack
-from switchmt_snn.config.yaml_io import differences, from_dict, load_config, to_dict, to_yaml
+from switchmt_snn.config.yaml_io import differences, from_dict, load_config, presets, to_dict, to_yaml
 
 __all__ = [
     "METHODS",
@@ -36,6 +36,7 @@ __all__ = [
     "field_documentation",
     "from_dict",
     "load_config",
+    "presets",
     "resolve",
     "resolved_frame_stack",
     "to_dict",

@@ -12,6 +12,7 @@ import types
 import typing
 from typing import Any, Literal, Union, cast, get_args, get_origin
 
+from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.config.plugins import PluginName, is_plugin
 from switchmt_snn.errors import ConfigError, nearest
 
@@ -103,6 +104,9 @@ def _scalar(kind: type[Any], value: Any, key: str) -> Any:
         # YAML 1.1 reads 1e-4 (no dot) as text; a researcher means a number.
         with contextlib.suppress(ValueError):
             number = float(value)
+    if kind is int and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            number = whole_number(value)
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
     if kind is float and is_number and math.isfinite(number):
         return float(number)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 _EXACT_INTEGERS = 2.0**53
 
 
@@ -27,7 +29,8 @@ def whole_number(text: str) -> int:
     try:
         return int(text)
     except ValueError:
-        number = float(text)
-        if not number.is_integer():
-            raise
-        return int(number)
+        pass
+    with contextlib.suppress(ValueError):
+        if (number := float(text)).is_integer():
+            return int(number)
+    raise ValueError(f"{text!r} is not a whole number such as 1000000 or 1e6")

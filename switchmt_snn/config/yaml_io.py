@@ -56,16 +56,25 @@ def load_config(
     return presumably_open(config) if reopen and is_older_run else config
 
 
+def presets() -> dict[str, str]:
+    """The presets by name, the default first, each with the first sentence of its file."""
+    texts = {name: text.split("\n# ")[0].removeprefix("# ") for name, text in sorted(_preset_texts().items())}
+    names = ["quickstart", *(name for name in texts if name != "quickstart")]
+    return {name: texts[name].split("\n")[0] for name in names}
+
+
+def _preset_texts() -> dict[str, str]:
+    entries = importlib.resources.files("switchmt_snn.configs").iterdir()
+    files = [entry for entry in entries if entry.name.endswith(".yaml")]
+    return {entry.name.removesuffix(".yaml"): entry.read_text(encoding="utf-8") for entry in files}
+
+
 def _preset_text(path: Path, shown: str) -> str:
-    presets = {
-        entry.name.removesuffix(".yaml"): entry
-        for entry in importlib.resources.files("switchmt_snn.configs").iterdir()
-        if entry.name.endswith(".yaml")
-    }
+    texts = _preset_texts()
     is_name = path.suffix in ("", ".yaml") and (len(path.parts) == 1 or path.parts[:-1] == ("configs",))
-    if is_name and path.stem in presets:
-        return presets[path.stem].read_text(encoding="utf-8")
-    raise ConfigError(f"no config file or preset {shown!r}{did_you_mean(path.stem, presets)}")
+    if is_name and path.stem in texts:
+        return texts[path.stem]
+    raise ConfigError(f"no config file or preset {shown!r}{did_you_mean(path.stem, texts)}")
 
 
 def from_dict(data: object, where: str = "config") -> ExperimentConfig:

@@ -76,7 +76,7 @@ def signatures() -> dict[str, list[type[Any]]]:
     """The ctypes of the arguments of every C++ function, read from the sources."""
     found = {}
     for source in _SOURCES:
-        text = source.read_text()
+        text = source.read_text("utf-8")
         for name, parameters in _DECLARATION.findall(text.replace('extern "C" void', "void")):
             found[name] = [_argument_type(parameter.split()) for parameter in parameters.split(",")]
     return found
@@ -112,7 +112,7 @@ def _compiler() -> list[str]:
 def _key(compiler: list[str]) -> str:
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
     parts = [
-        *(source.read_text() for source in (_HEADER, *_SOURCES)),
+        *(source.read_text("utf-8") for source in (_HEADER, *_SOURCES)),
         *compiler,
         version,
         *_FLAGS,

@@ -68,13 +68,17 @@ class MethodDescription:
 
 
 def describe(config: ExperimentConfig) -> dict[str, MethodDescription]:
-    """Describe every method under a config's settings (those that a method cannot have fall back to its own)."""
-    suite = make_suite(config.tasks)
+    """Describe every method under a config's settings (those that a method cannot have fall back to its own).
+
+    Args:
+        config: not resolved, so that T of the spiking methods is known where the config's own method is an ANN.
+    """
+    suite = make_suite(resolve(config).tasks)
     return {method: describe_method(with_method(config, method), suite) for method in METHODS}
 
 
 def with_method(config: ExperimentConfig, method: str) -> ExperimentConfig:
-    """The resolved config with another method; settings that the method cannot have take its own values."""
+    """The config with another method, resolved; settings that the method cannot have take its own values."""
     if method == config.network.method:
         return resolve(config)
     traits = METHOD_TRAITS[method]

@@ -16,6 +16,7 @@ import torch
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.config.plugins import is_plugin, plugin_file
+from switchmt_snn.machine.program import NAME, is_module
 from switchmt_snn.tasks.registry import SUITES, suite_of
 
 _PACKAGES = ("switchmt-snn", "torch", "snntorch", "numpy", "safetensors", "zstandard")
@@ -60,9 +61,9 @@ def files_sha256(config: ExperimentConfig) -> dict[str, str]:
 
 def command_line() -> str:
     """The command line without the folder in which the program lies; ``python`` for a library call."""
-    program = Path(sys.argv[0]).name
-    ours = program in ("switchmt-snn", "__main__.py")
-    return shlex.join(["switchmt-snn", *sys.argv[1:]]) if ours else f"python {program}"
+    called = Path(sys.argv[0])
+    ours = called.name == NAME or is_module(called)
+    return shlex.join([NAME, *sys.argv[1:]]) if ours else f"python {called.name}"
 
 
 def processor() -> str:

@@ -198,7 +198,7 @@ class RunFolder:
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""
         by_task: dict[str, list[float]] = {}
-        with (self.path / "episodes.csv").open(newline="") as stream:
+        with (self.path / "episodes.csv").open(encoding="utf-8", newline="") as stream:
             for row in csv.DictReader(stream):
                 by_task.setdefault(row["task"], []).append(float(row["return"]))
         return {task: (values[:episodes], values[-episodes:]) for task, values in by_task.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from rich import box
@@ -13,9 +14,12 @@ from switchmt_snn.runs.description import MethodDescription
 from switchmt_snn.tasks.registry import find_suite
 from switchmt_snn.tasks.suite import Suite
 
+HEADING = 12
+"""Characters in a line of a heading."""
+
 
 def _table(title: str, caption: str | None = None) -> Table:
-    """A table that fits 80 columns."""
+    """A table for 80 columns with names of usual length; in a narrower place, texts wrap and numbers stay whole."""
     return Table(
         title=title,
         caption=caption,
@@ -29,25 +33,35 @@ def _table(title: str, caption: str | None = None) -> Table:
 
 def _add_columns(table: Table, left: tuple[str, ...], right: tuple[str, ...]) -> None:
     for name in left:
-        table.add_column(name, no_wrap=True)
+        table.add_column(name, overflow="fold")
     for name in right:
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(_broken(name), justify="right", no_wrap=True)
+
+
+def _broken(name: str) -> str:
+    """A heading over several lines of at most 12 characters, if its parts are no longer: a task's name is not cut."""
+    lines = [""]
+    for part in re.split(r"(?<=[-_/:. ])", name):
+        if lines[-1] and len(lines[-1] + part) > HEADING:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)
 
 
 def evaluation_table(evaluation: Evaluation) -> Table:
-    """Scores of agent and random policy, then the rows that the suite knows from publications."""
+    """Task by task: the agent, the random policy, and what the suite knows from publications."""
     table = _table(f"Scores at step {evaluation.step:,}", str(evaluation.protocol))
-    _add_columns(table, ("policy", "task"), ("mean", "± s.e.", "median", "human", "steps", "mean Q", "n"))
-    for row in evaluation.tasks:
-        table.add_row(*_score_cells(row))
+    _add_columns(table, ("task", "policy"), ("mean", "± s.e.", "median", "human", "steps", "mean Q", "n"))
     suite = find_suite(evaluation.protocol.suite)
-    rows = published_rows(suite, list(dict.fromkeys(row.task for row in evaluation.tasks)))
-    if rows:
-        table.add_section()
-    for policy, task, mean in rows:
+    for task in dict.fromkeys(row.task for row in evaluation.tasks):
+        for row in evaluation.tasks:
+            if row.task == task:
+                table.add_row(*_score_cells(row))
         reference = suite.references.get(task)
-        normalized = None if reference is None else reference.normalized(mean)
-        table.add_row(policy, task, f"{mean:.1f}", "", "", _percent(normalized), "", "", "")
+        for policy, _, mean in published_rows(suite, [task]):
+            normalized = None if reference is None else reference.normalized(mean)
+            table.add_row(task, policy, f"{mean:.1f}", "", "", _percent(normalized), "", "", "")
+        table.add_section()
     return table
 
 
@@ -62,8 +76,8 @@ def _percent(value: float | None) -> str:
 
 def _score_cells(row: TaskScore) -> list[str]:
     return [
-        row.policy,
         row.task,
+        row.policy,
         f"{row.mean:.2f}",
         "" if row.standard_error is None else f"{row.standard_error:.2f}",
         f"{row.median:.1f}",
@@ -200,10 +214,11 @@ def _yes(holds: bool) -> str:
     return "yes" if holds else "no"
 
 
-def methods_table(methods: dict[str, MethodDescription]) -> Table:
-    """One row per method."""
+def methods_table(methods: dict[str, MethodDescription], source: str) -> Table:
+    """One row per method; ``source`` names the config."""
     table = _table(
-        "Methods under this config", "ops: dense synaptic operations per decision, in millions; T: simulation steps"
+        f"Methods under the config {source}",
+        "ops: dense synaptic operations per decision, in millions; T: simulation steps",
     )
     _add_columns(table, ("method",), ("parameters", "neurons", "T", "ops (M)", "GiB"))
     table.add_column("switching", no_wrap=True)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest import mock
 
 import tyro
+from tyro.constructors import ConstructorRegistry
 
 from switchmt_snn.cli import main
 from switchmt_snn.cli.entry import COMMANDS
@@ -20,8 +20,8 @@ def options(command: str) -> list[str]:
     """The options of a command with their values, in the order of its help, from the parser that tyro makes."""
     found: list[str] = []
 
-    def listed(kind: Any, default: Any, args: Sequence[str], prog: str) -> NoReturn:
-        for action in tyro.extras.get_parser(kind, default=default, prog=prog)._actions:
+    def listed(kind: Any, default: Any, registry: ConstructorRegistry, **_: Any) -> NoReturn:
+        for action in tyro.extras.get_parser(kind, default=default, registry=registry)._actions:
             values = action.metavar or "/".join(map(str, action.choices or ()))
             found.append(" ".join([*action.option_strings, str(values)]).strip())
         raise SystemExit(0)

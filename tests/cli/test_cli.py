@@ -60,6 +60,32 @@ def test_describe_shows_the_configs_own_network(capsys) -> None:
     assert counts["DQN"] == TABLE_3["DQN"]
 
 
+def test_describe_gives_spiking_methods_their_steps_where_the_configs_method_is_an_ann(capsys, tmp_path: Path) -> None:
+    """T is of the method that is described: in the config, by a flag, and from a run's resolved config."""
+    _, out, _ = call(capsys, "describe", "--json")
+    expected = json.loads(out)["methods"]
+    flags = ["--network.method", "DQN"]
+    path = tmp_path / "config.yaml"
+    path.write_text(call(capsys, "train", *flags, "--print-config")[1])
+    for words in (flags, [str(path)]):
+        code, out, err = call(capsys, "describe", *words, "--json")
+        assert code == 0, err
+        methods = json.loads(out)["methods"]
+        assert {name: facts["timesteps"] for name, facts in methods.items()} == {
+            name: 1 if name in ("DQN", "DQN_D") else 4 for name in METHODS
+        }
+        keys = ("dense_operations_per_decision", "trainable_parameters", "switching_policy")
+        for name in METHODS:
+            assert [methods[name][key] for key in keys] == [expected[name][key] for key in keys]
+
+
+def test_describe_says_which_config_and_takes_the_one_that_train_takes(capsys) -> None:
+    _, out, _ = call(capsys, "describe")
+    assert out.startswith("Methods under the config quickstart")
+    _, out, _ = call(capsys, "describe", "--json", "minatar")
+    assert (json.loads(out)["config"], json.loads(out)["source"]) == ("minatar", "minatar")
+
+
 def test_describe_names_trained_and_deployed_parameters(capsys) -> None:
     """32 quantiles add 31 times the heads in training; what decides has the paper's count."""
     flags = ["describe", "--network.quantiles", "32", "--learning.loss", "huber"]
@@ -163,7 +189,7 @@ def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypat
         (["trian"], "unknown command 'trian'; did you mean 'train'?"),
         (["train", "nothing.yaml"], "no config file or preset 'nothing.yaml'"),
         (["train", "--learning.batchsize", "3"], "--learning.batch-size"),
-        (["train", "--learning.batch-size", "many"], "invalid literal for int"),
+        (["train", "--learning.batch-size", "many"], "'many' is not a whole number such as 1000000 or 1e6"),
         (["train", "--network.timesteps", "0"], "network.timesteps is 0, expected at least 1"),
         (["train", "--total-steps", "-1"], "total_steps is -1, expected at least 1"),
         (["train", "--tasks.names", "pongg"], "did you mean 'pong'"),
