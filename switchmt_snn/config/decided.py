@@ -88,8 +88,8 @@ _OPEN: dict[str, Any] = {
 def presumably_open(config: ExperimentConfig) -> ExperimentConfig:
     """A run's config from before there were records: values that the rules give as well are taken as left open.
 
-    T of an ANN was not stored; it becomes the default. So do the engine that acts, if it is the one that updates, and
-    the compression of the replay, which changes no number.
+    T of an ANN was not stored; it becomes the default. So do an engine other than eager, which not every network has,
+    the engine that acts, if it is the one that updates, and the compression of the replay, which changes no number.
     """
     for key, value in _OPEN.items():
         section, name = key.split(".")
@@ -101,4 +101,6 @@ def presumably_open(config: ExperimentConfig) -> ExperimentConfig:
         network = replace(network, timesteps=type(network).timesteps)
     if learning.acting == learning.engine:
         learning = replace(learning, acting="auto")
+    if learning.engine != "eager":
+        learning = replace(learning, engine="auto")
     return replace(config, network=network, learning=learning)

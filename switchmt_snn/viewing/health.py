@@ -1,44 +1,77 @@
-"""Names trouble in a running training, with a remedy."""
+"""Names trouble in a running training, with remedies that this run has not taken yet."""
 
 from __future__ import annotations
 
 import math
 
-from switchmt_snn.config import NetworkConfig
+from switchmt_snn.config import ExperimentConfig, LearningConfig, NetworkConfig
 from switchmt_snn.learning.events import Measured
 
 DEAD_SHARE = 0.95
 SATURATED_SHARE = 0.5
-LARGE_Q = 1_000.0
+LARGE_FACTOR = 10.0
+"""Q-values that are this many times as large as they can rightly be explode."""
+EARLY_UPDATES = 2_000
+"""Before so many updates, silent neurons say little of those that training ends with."""
 STREAMS = ("q", "value", "advantage")
 
 
-def health_warnings(measured: Measured, network: NetworkConfig) -> list[str]:
-    """What looks wrong, one line each: seen, and what to try.
+def health_warnings(measured: Measured, config: ExperimentConfig, largest_return: float) -> dict[str, str]:
+    """What looks wrong: a line with what was seen and what to try, by a name that stays while the numbers change.
 
-    Rewards are clipped to [-1, 1] by default, so |Q| cannot rightly exceed 1 / (1 - discount) = 100.
+    Args:
+        measured: of the network now.
+        config: the run's; a remedy that it has already is not named.
+        largest_return: of the training episodes so far, in absolute value.
     """
-    warnings = []
+    warnings = {}
     for name, layer in measured.layers.items():
-        if layer.dead > DEAD_SHARE:
-            warnings.append(
-                f"layer {name}: {layer.dead:.0%} of the neurons never fire; {_remedy_for_silence(name, network)}"
+        if measured.updates >= EARLY_UPDATES and layer.dead > DEAD_SHARE:
+            remedy = _remedy_for_silence(name, config.network)
+            warnings[f"silent {name}"] = f"layer {name}: {layer.dead:.0%} of the neurons never fire; {remedy}"
+        if measured.updates >= EARLY_UPDATES and layer.saturated > SATURATED_SHARE:
+            remedy = _remedy_for_saturation(name, config.network)
+            warnings[f"saturated {name}"] = (
+                f"layer {name}: {layer.saturated:.0%} of the neurons fire at every step; {remedy}"
             )
-        if layer.saturated > SATURATED_SHARE:
-            warnings.append(
-                f"layer {name}: {layer.saturated:.0%} of the neurons fire at every step; raise network.threshold"
-            )
-    if measured.q is not None and math.isfinite(measured.q) and abs(measured.q) > LARGE_Q:
-        warnings.append(
-            f"mean Q is {measured.q:.3g}: values explode; lower learning.learning_rate, use learning.loss=huber or "
-            "learning.clip_rewards=true"
+    bound = largest_q(config.learning, largest_return)
+    if measured.q is not None and math.isfinite(measured.q) and abs(measured.q) > LARGE_FACTOR * bound:
+        warnings["large Q"] = (
+            f"mean Q is {measured.q:.3g}, expected at most about {bound:.3g}: values explode; "
+            f"{_remedy_for_large_values(config.learning)}"
         )
     return warnings
 
 
+def largest_q(learning: LearningConfig, largest_return: float) -> float:
+    """About the largest |Q| that returns allow: 1 / (1 - discount) with clipped rewards, else the largest return."""
+    if not learning.clip_rewards:
+        return max(1.0, largest_return)
+    return 1.0 / (1.0 - learning.discount) if learning.discount < 1.0 else math.inf
+
+
 def _remedy_for_silence(layer: str, network: NetworkConfig) -> str:
-    if layer not in STREAMS:
-        return "lower network.threshold, raise network.timesteps or widen the surrogate (network.surrogate_slope)"
-    if network.stream_normalization == "none":
-        return "use network.stream_normalization=batch"
-    return f"raise network.stream_current_thresholds (now {network.stream_current_thresholds:g})"
+    if layer in STREAMS:
+        if network.stream_normalization == "none":
+            return "use network.stream_normalization=batch"
+        return f"raise network.stream_current_thresholds (now {network.stream_current_thresholds:g})"
+    if network.trunk == "mlp" and network.mlp_normalization == "none":
+        return "use network.mlp_normalization=batch"
+    return f"lower network.threshold (now {network.threshold:g}) or raise network.timesteps (now {network.timesteps})"
+
+
+def _remedy_for_saturation(layer: str, network: NetworkConfig) -> str:
+    if layer in STREAMS and network.stream_normalization == "batch":  # its currents are in thresholds
+        return f"lower network.stream_current_thresholds (now {network.stream_current_thresholds:g})"
+    return f"raise network.threshold (now {network.threshold:g})"
+
+
+def _remedy_for_large_values(learning: LearningConfig) -> str:
+    remedies = [f"lower learning.learning_rate (now {learning.learning_rate:g})"]
+    if learning.loss == "mse":
+        remedies.append("use learning.loss=huber")
+    if learning.gradient_clip == "none":
+        remedies.append("use learning.gradient_clip=norm")
+    if not learning.clip_rewards:
+        remedies.append("use learning.clip_rewards=true")
+    return ", ".join(remedies[:-1]) + " or " + remedies[-1] if len(remedies) > 1 else remedies[0]

@@ -30,8 +30,9 @@ class Progress:
         self._live: Live | None = None
         self._epsilon = 1.0
         self._warming_up = False
-        self._warnings: list[str] = []
-        self._said: list[str] = []  # a plain log repeats no warning that still holds
+        self._warnings: dict[str, str] = {}
+        self._said: set[str] = set()  # a plain log says each warning once
+        self._largest_return = 0.0
         self._distance = ""
         self._shown_at = 0.0
         self._loss: float | None = None
@@ -64,9 +65,10 @@ class Progress:
             self._show()
         elif isinstance(event, EpisodeEnded):
             self._returns[event.task].append(event.episode_return)
+            self._largest_return = max(self._largest_return, abs(event.episode_return))
         elif isinstance(event, Measured):
             self._loss, self._q = event.loss, event.q
-            self._warnings = health_warnings(event, self._training.config.network)
+            self._warnings = health_warnings(event, self._training.config, self._largest_return)
         elif isinstance(event, SwitchDecided):
             self._distance = _distance(event)
 
@@ -113,20 +115,20 @@ class Progress:
             highlight=False,
             soft_wrap=True,
         )
-        health = self._health()
-        for line in health:
-            if line not in self._said:
+        for name, line in self._health().items():
+            if name not in self._said:
                 self.console.print(f"  {line}", highlight=False, soft_wrap=True)
-        self._said = health
+                self._said.add(name)
 
     def _learning(self) -> str:
         return "" if self._loss is None else f" loss {self._loss:.4g} Q {self._q or 0.0:.3f}"
 
-    def _health(self) -> list[str]:
-        lines = [f"warning: {text}" for text in self._warnings]
+    def _health(self) -> dict[str, str]:
+        lines = {name: f"warning: {text}" for name, text in self._warnings.items()}
         if self._warming_up:
             starts = self._training.config.learning.learning_starts_steps
-            lines.append(f"filling this task's replay: random actions until {starts:,} transitions")
+            task = self._training.suite.names[self._training.task]
+            lines[f"filling {task}"] = f"filling the replay of {task}: random actions until {starts:,} transitions"
         return lines
 
     def _table(self) -> Group:
@@ -150,7 +152,7 @@ class Progress:
             f"step {training.steps:,} of {training.config.total_steps:,}, {rate:.0f} steps/s, left {left}, "
             f"updates {training.learner.updates:,}{self._learning()}"
         )
-        return Group(table, status, *(Text(line, style="yellow") for line in self._health()))
+        return Group(table, status, *(Text(line, style="yellow") for line in self._health().values()))
 
 
 class Speed:
