@@ -3,8 +3,8 @@
 ``python -m benchmarks.running_statistics RUN [--out FILE.csv]``. The newest checkpoint's network plays with running
 statistics; it learns with those of the batch. For each task both give Q-values of the same observations from the
 replay: the second set with statistics that were estimated anew, over many batches. Written for each task: the
-correlation of their largest Q-values, how often both choose the same action, and their means; and for each layer how
-far the running mean is off, in standard deviations of its currents.
+correlation of their largest Q-values, how often both choose the same action, and their means, also those of the target
+network; and for each layer how far the running mean is off, in standard deviations of its currents.
 """
 
 from __future__ import annotations
@@ -50,18 +50,22 @@ def rows(run: Path) -> Iterator[dict[str, Any]]:
 
 def _compare(training: Training, task: int) -> dict[str, float]:
     rng, device = np.random.default_rng(SEED), training.learner.device
-    replay, running = training.replays[task], training.learner.network.eval()
+    replay, running, target = training.replays[task], training.learner.network.eval(), training.learner.target
     seen = [torch.as_tensor(replay.sample(BATCH_SIZE, rng, Returns()).observations) for _ in range(2 * BATCHES)]
-    fresh = copy.deepcopy(running)
-    reestimate_statistics([fresh], task, (x.to(device) for x in seen[:BATCHES]), torch.Generator(device))
+    fresh, fresh_target = copy.deepcopy(running), copy.deepcopy(target)
+    for network in (fresh, fresh_target):
+        reestimate_statistics(network, task, (x.to(device) for x in seen[:BATCHES]), torch.Generator(device))
     valid = torch.from_numpy(training.suite.valid_actions_KA[task])
-    ours, theirs = (_q_values(net, seen[BATCHES:], task)[:, valid] for net in (running, fresh))
+    networks = (running, fresh, target, fresh_target)
+    ours, theirs, targets, fresh_targets = (_q_values(net, seen[BATCHES:], task)[:, valid] for net in networks)
     largest = torch.stack([ours.amax(1), theirs.amax(1)])
     return {
         "correlation": float(torch.corrcoef(largest)[0, 1]),
         "same_action": float((ours.argmax(1) == theirs.argmax(1)).float().mean()),
         "q_running": float(largest[0].mean()),
         "q_fresh": float(largest[1].mean()),
+        "target_running": float(targets.amax(1).mean()),
+        "target_fresh": float(fresh_targets.amax(1).mean()),
         **{f"off_{name}": value for name, value in _distances(running, fresh, task).items()},
     }
 

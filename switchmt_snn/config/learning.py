@@ -80,9 +80,9 @@ class LearningConfig:
     target_update_every_updates: int | None = None
     """Count these copies in updates, over all tasks: a number takes the place of target_update_every_steps."""
     reestimate_statistics_batches: int = 0
-    """Estimate BatchNorm's running statistics of a task anew from so many batches of its replay: of Q and Q* when a
-    visit to the task starts, of Q for all tasks before an evaluation and at the end. Later weights have other
-    statistics, and a task that was away looks forgotten without it. 0: off."""
+    """Estimate BatchNorm's running statistics of Q anew from so many batches of each task's replay: before each copy to
+    Q*, when a visit to the task starts, before an evaluation and at the end. Running statistics belong to past weights:
+    targets are biased, and a task that was away looks forgotten. 0: off."""
     first_layer_mean: Literal["running", "input"] = "running"
     """Where BatchNorm takes the first layer's running mean from. running: the mean of its currents over past updates.
     input: its present weights times the running mean input, set after every update, so that the network that acts is

@@ -6,7 +6,7 @@ the shared weights move on. Then a task looks forgotten that is not. CaRe-BN (IC
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -17,24 +17,20 @@ from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 
 @torch.no_grad()
-def reestimate_statistics(
-    networks: Sequence[QNetwork], task: int, batches: Iterable[Tensor], generator: torch.Generator
-) -> None:
+def reestimate_statistics(network: QNetwork, task: int, batches: Iterable[Tensor], generator: torch.Generator) -> None:
     """Replace a task's running mean and variance in every BatchNorm by their means over batches.
 
-    Each batch goes through the networks in training mode, in float32. Nothing but these statistics changes.
+    Each batch goes through the network in training mode, in float32. Nothing but these statistics changes.
 
     Args:
-        networks: each gets the statistics of its own weights.
+        network: gets the statistics of its present weights.
         task: task index k.
-        batches: raw observations ``[B, *shape]`` on the networks' device.
+        batches: raw observations ``[B, *shape]`` on the network's device.
         generator: source of the encoding's random numbers.
     """
     for count, observations in enumerate(batches, start=1):
-        for network in networks:
-            with _momentum(network, 1.0 / count):  # the mean over the batches so far
-                inputs = network.encode(observations, generator)
-                network.values(inputs, network.context(task), training=True)
+        with _momentum(network, 1.0 / count):  # the mean over the batches so far
+            network.values(network.encode(observations, generator), network.context(task), training=True)
 
 
 @contextmanager

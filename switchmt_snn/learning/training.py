@@ -201,6 +201,7 @@ class Training(Stateful):
     def _copy_target(self, passed: int) -> None:
         """Copy the target network if it is due, after so many more steps or updates."""
         for _ in range(self.target_clock.advance(passed)):
+            self.reestimate_statistics()
             self.learner.copy_target()  # Q* <- Q
 
     def _end_episodes(self, play: Play, played: VectorStep, epsilon: float) -> Iterator[Event]:
@@ -252,7 +253,7 @@ class Training(Stateful):
         self.steps_in_visit = 0
         self.updates_in_visit = 0
         self.episodes_in_visit = 0
-        self._reestimate(task, self.learner.network, self.learner.target)
+        self._reestimate(task, self.learner.network)
         self._begin_episodes()
 
     def reestimate_statistics(self) -> None:
@@ -272,7 +273,7 @@ class Training(Stateful):
             self._reestimate(task, network)
         return network
 
-    def _reestimate(self, task: int, *networks: QNetwork) -> None:
+    def _reestimate(self, task: int, network: QNetwork) -> None:
         learning, replay = self.config.learning, self.replays[task]
         if learning.reestimate_statistics_batches == 0 or self.is_warming_up(task):
             return
@@ -283,7 +284,7 @@ class Training(Stateful):
             for _ in range(learning.reestimate_statistics_batches)
         )
         batches = (x if isinstance(x, Tensor) else to_device(x, self.learner.device) for x in drawn)
-        reestimate_statistics(networks, task, batches, generator)
+        reestimate_statistics(network, task, batches, generator)
 
     def _begin_episodes(self) -> None:
         """Start an episode in every copy of the current task that has none."""

@@ -29,7 +29,7 @@ NETWORK = {"mlp_normalization": "batch", "stream_normalization": "batch"}
 
 def training(batches: int, engine: str = "eager", **network: Any) -> Training:
     suite = vector_suite(lambda task, n: CountingEnvironment(task, n, 7), 4)
-    suite = replace(suite, in_unit_range=True, scale=0.1)  # rate takes it, too
+    suite = replace(suite, in_unit_range=True, scale=1e-4)  # rate takes it, too
     config = small_config(
         network={**NETWORK, **network},
         learning={"reestimate_statistics_batches": batches, "engine": engine, "acting": engine},
@@ -59,7 +59,7 @@ def test_statistics_are_the_means_over_batches_of_the_replay() -> None:
             layer.momentum = 1.0
         naive.train()(batch, 1)
         expected.append([torch.stack(layer.statistics(1)).clone() for layer in layers(naive)])
-    reestimate_statistics([network], 1, batches, torch.Generator())
+    reestimate_statistics(network, 1, batches, torch.Generator())
     assert len(layers(network)) == 3
     for number, layer in enumerate(layers(network)):
         mean = torch.stack([each[number] for each in expected]).mean(0)
@@ -72,7 +72,7 @@ def test_nothing_but_the_task_s_statistics_changes() -> None:
     network = part.learner.network
     before = copy.deepcopy(network.state_dict())
     batch = torch.from_numpy(part.replays[1].sample(8, np.random.default_rng(3), Returns()).observations)
-    reestimate_statistics([network], 1, [batch], torch.Generator())
+    reestimate_statistics(network, 1, [batch], torch.Generator())
     changed = 0
     for name, tensor in network.state_dict().items():
         if "running" in name:
@@ -83,20 +83,45 @@ def test_nothing_but_the_task_s_statistics_changes() -> None:
     assert changed == 6, "mean and variance of trunk, value and advantage"
 
 
-def test_a_visit_starts_with_fresh_statistics_of_its_task_in_both_networks() -> None:
-    part = played(3)
+def updated(**network: Any) -> Training:
+    """A training whose statistics have moved since they were estimated last, those of both tasks."""
+    part, rng = played(3, **network), np.random.default_rng(0)
     for task in range(2):
-        before = copy.deepcopy([part.learner.network.state_dict(), part.learner.target.state_dict()])
-        part._enter(task)
-        for was, network in zip(before, (part.learner.network, part.learner.target), strict=True):
-            for name, tensor in network.state_dict().items():
-                if "running" in name:
-                    assert not torch.equal(tensor[task], was[name][task]), name
-                    assert torch.equal(tensor[1 - task], was[name][1 - task]), name
+        part.learner.update(part.replays[task].sample(8, rng, Returns()), task)
+    return part
+
+
+def changed_tasks(network: QNetwork, before: dict[str, torch.Tensor]) -> set[int]:
+    """The tasks whose statistics are others now, in every layer."""
+    changed = [
+        {task for task in range(2) if not torch.equal(tensor[task], before[name][task])}
+        for name, tensor in network.state_dict().items()
+        if "running" in name
+    ]
+    assert all(tasks == changed[0] for tasks in changed)
+    return changed[0]
+
+
+@pytest.mark.parametrize("task", [0, 1])
+def test_a_visit_starts_with_fresh_statistics_of_its_task(task: int) -> None:
+    part = updated()
+    before = copy.deepcopy([part.learner.network.state_dict(), part.learner.target.state_dict()])
+    part._enter(task)
+    assert changed_tasks(part.learner.network, before[0]) == {task}
+    assert changed_tasks(part.learner.target, before[1]) == set()
+
+
+def test_the_target_network_is_copied_with_fresh_statistics_of_all_tasks() -> None:
+    part = updated()
+    fresh = part.with_fresh_statistics().state_dict()
+    assert changed_tasks(part.learner.target, fresh) == {0, 1}
+    part._copy_target(passed=part.target_clock.period_steps)
+    for name, tensor in part.learner.target.state_dict().items():
+        assert torch.equal(tensor, fresh[name]), name
 
 
 def test_estimating_twice_at_a_step_gives_the_same_statistics_and_draws_nothing_of_training() -> None:
-    part = played(3, encoding="rate")
+    part = updated(encoding="rate")
     draws = copy.deepcopy((part.sample_rng.bit_generator.state, part.learner.generator.get_state()))
     fresh = part.with_fresh_statistics().state_dict()
     assert any(not torch.equal(fresh[name], x) for name, x in part.learner.network.state_dict().items())
