@@ -17,9 +17,19 @@ if TYPE_CHECKING:
     from switchmt_snn.config.yaml_io import load_config
     from switchmt_snn.runs.run import evaluate, load_agent, train
     from switchmt_snn.tasks.registry import register_suite
+    from switchmt_snn.tasks.report import check_env
 
 __version__ = "0.1.0"
-__all__ = ["ExperimentConfig", "__version__", "evaluate", "load_agent", "load_config", "register_suite", "train"]
+__all__ = [
+    "ExperimentConfig",
+    "__version__",
+    "check_env",
+    "evaluate",
+    "load_agent",
+    "load_config",
+    "register_suite",
+    "train",
+]
 
 _HOMES = {
     "ExperimentConfig": "switchmt_snn.config",
@@ -27,6 +37,7 @@ _HOMES = {
     "evaluate": "switchmt_snn.runs.run",
     "load_agent": "switchmt_snn.runs.run",
     "register_suite": "switchmt_snn.tasks.registry",
+    "check_env": "switchmt_snn.tasks.report",
     "train": "switchmt_snn.runs.run",
 }
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 
 from switchmt_snn import __version__
-from switchmt_snn.cli import describe, doctor, evaluate, export, profile, train
+from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, profile, train
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.machine.program import runnable
 from switchmt_snn.viewing.output import speak_any_encoding
@@ -19,6 +19,7 @@ usage: switchmt-snn COMMAND [options]
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
+  check-env ID ...    what an environment is taken for, how it plays, and why training would refuse it
   doctor              versions, games and devices of this installation
 
   switchmt-snn COMMAND --help shows a command's options; --version the version.
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "export": export.command,
     "profile": profile.command,
     "describe": describe.command,
+    "check-env": check_env.command,
     "doctor": doctor.command,
 }
 

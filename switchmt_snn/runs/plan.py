@@ -79,7 +79,7 @@ def plan(
     if is_plugin(config.switching.policy):
         check_policy(config.switching)
     suite = make_suite(config.tasks)
-    check_before_training(config.tasks, suite)
+    warnings = check_before_training(config.tasks, suite)
     if is_plugin(config.network.encoding):
         try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)
     config, notes = decide(config, stored, suite, device, processes)
@@ -87,7 +87,7 @@ def plan(
     memory = describe_method(config, suite).memory
     require_memory(memory, config)
     require_gpu_memory(config, suite)
-    return Plan(config, suite, device, memory, notes)
+    return Plan(config, suite, device, memory, (*warnings, *notes))
 
 
 def decide(

@@ -78,6 +78,11 @@ class GymCopies:
             self._place(frames[i], observation, env)
         return VectorStep(frames, rewards, terminated, truncated)
 
+    @property
+    def draws_globally(self) -> bool:
+        """Whether an environment has drawn from the global generators since its last reset, or seeded them."""
+        return any(generators is not None and generators.were_used for generators in self._generators)
+
     def close(self) -> None:
         """Close the copies."""
         for env in self._envs:

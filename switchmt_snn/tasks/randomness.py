@@ -26,8 +26,16 @@ class OwnGenerators:
 
     def seed(self, seed: int) -> None:
         """Seed both, for the next entry."""
+        self._seed = seed
         self._python = random.Random(seed).getstate()
         self._numpy: np.random.BitGenerator = np.random.MT19937(seed)
+
+    @property
+    def were_used(self) -> bool:
+        """Whether the environment drew from one of them, or seeded it, since ``seed``."""
+        fresh = OwnGenerators()
+        fresh.seed(self._seed)
+        return fresh._python != self._python or str(fresh._numpy.state) != str(self._numpy.state)
 
     def __enter__(self) -> None:
         _ONE_AT_A_TIME.acquire()

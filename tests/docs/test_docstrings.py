@@ -11,6 +11,7 @@ import pytest
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config
+from switchmt_snn.config.numbers import exact, whole_number
 from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
 from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.learning.switching import SwitchingPolicy
@@ -18,12 +19,18 @@ from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.runs.run import train
 from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.report import check_env
+from switchmt_snn.viewing.progress import duration
 
 EXAMPLES: tuple[Any, ...] = (
     load_config,
+    exact,
+    whole_number,
+    duration,
     file_name,
     json_text,
     make_environment,
+    check_env,
     train,
     Agent.act,
     FrameReplay,

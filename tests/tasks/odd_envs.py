@@ -227,6 +227,32 @@ class SharedState(Plain):
         return float(type(self).count % 7)
 
 
+class KeepsState(Plain):
+    """Remembers its last action beyond reset."""
+
+    last = 0
+
+    def reward(self, action: Any) -> Any:
+        before, self.last = self.last, int(action) + self.last
+        return float(before % 5)
+
+
+class Large(Plain):
+    observation_space = Box(-1e4, 1e4, (4,), np.float32)
+
+    def observe(self) -> Any:
+        return np.full(4, 100.0 * self.steps, np.float32)
+
+
+class FaintImage(Plain):
+    """Small whole numbers as pixels, as grid worlds give them."""
+
+    observation_space = Box(0, 255, (7, 7, 3), np.uint8)
+
+    def observe(self) -> Any:
+        return np.full((7, 7, 3), self.steps % 11, np.uint8)
+
+
 class Endless(Plain):
     length = 10**12
 

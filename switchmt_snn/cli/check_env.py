@@ -1,0 +1,99 @@
+"""``switchmt-snn check-env``: what an environment is taken for, and how it plays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from switchmt_snn.cli.parsing import leading_names, parse
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.runs.files import json_text
+
+if TYPE_CHECKING:
+    from switchmt_snn.tasks.report import EnvironmentReport
+
+
+@dataclass(frozen=True)
+class CheckEnvOptions:
+    """check-env ID [ID ...]: what environments are taken for, how they play, and why training would refuse them.
+    Several IDs must fit one network."""
+
+    suite: str = "gym"
+    """As tasks.suite: gym (Gymnasium ids, also module:MyEnv-v0), atari, minatar, or module:MySuite."""
+    wrappers: tuple[str, ...] = ()
+    """As tasks.wrappers."""
+    image_layout: Literal["by_shape", "channels_last", "channels_first"] = "by_shape"
+    """As tasks.image_layout."""
+    steps: int = 1000
+    """Steps of random play."""
+    json: bool = False
+    """Print the facts as JSON."""
+
+
+def command(argv: list[str]) -> int:
+    """Run the command; returns its exit code."""
+    names, rest = leading_names(argv)
+    options = parse(CheckEnvOptions, rest, "check-env", CheckEnvOptions())
+    if not names:
+        raise ConfigError("check-env was given no environment, expected one: switchmt-snn check-env CartPole-v1")
+    if options.steps < 1:
+        raise ConfigError(f"--steps is {options.steps}, expected at least 1")
+    from switchmt_snn.tasks.report import check_env
+
+    reports = check_env(
+        *names,
+        suite=options.suite,
+        steps=options.steps,
+        wrappers=options.wrappers,
+        image_layout=options.image_layout,
+    )
+    if options.json:
+        print(json_text([report.to_dict() for report in reports]))
+        return 0
+    for report in reports:
+        print("\n".join(_lines(report)))
+    return 0
+
+
+def _lines(report: EnvironmentReport) -> list[str]:
+    kinds = {
+        "vector": "a vector of {0} numbers",
+        "channels_last": "images, channels last: frames of {0} channels, {1} x {2}",
+        "channels_first": "images, channels first: frames of {0} channels, {1} x {2}",
+        "grey": "grey images: frames of {0} channel, {1} x {2}",
+    }
+    low, high = report.observed
+    count = len(report.episode_lengths)
+    ended = f"{count} ended in {report.steps:,} steps of random play"
+    if count:
+        lengths, returns = report.episode_lengths, report.episode_returns
+        ended += (
+            f", after {min(lengths):,} to {max(lengths):,} steps (mean {sum(lengths) / count:,.0f}), "
+            f"{report.truncated} of them truncated; returns from {min(returns):g} to {max(returns):g} (mean "
+            f"{sum(returns) / count:g})"
+        )
+    yes = {True: "yes", False: "no"}
+    threads = "several threads at a time" if report.played_in_threads else "one thread"
+    rows = {
+        "space": report.observes,
+        "taken for": kinds[report.layout].format(*report.frame_shape)
+        + f", {report.frame_dtype}, times {report.scale:g}",
+        "observed": f"values from {low:g} to {high:g}",
+        "actions": f"{len(report.actions)}: {_numbers(report.actions)}",
+        "rewards": f"from {report.rewards[0]:g} to {report.rewards[1]:g}",
+        "episodes": ended,
+        "limit": None if report.limit_steps is None else f"{report.limit_steps:,} steps",
+        "same seed": f"plays the same again: {yes[report.repeats]}; after other episodes: {yes[report.starts_afresh]}",
+        "other seed": f"plays something else: {yes[report.seeds_differ]}",
+        "threads": f"evaluations use {threads}; the same in several: {yes[report.same_in_threads]}",
+        "speed": f"{report.steps_per_s:,.0f} steps/s, one copy",
+    }
+    lines = [f"{report.task} ({report.suite}): can be trained"]
+    lines += [f"  {key:<10} {value}" for key, value in rows.items() if value is not None]
+    return [*lines, *(f"  note: {note}" for note in report.notes)]
+
+
+def _numbers(actions: tuple[int, ...]) -> str:
+    if actions == tuple(range(actions[0], actions[-1] + 1)) and len(actions) > 1:
+        return f"{actions[0]} to {actions[-1]}"
+    return ", ".join(map(str, actions))

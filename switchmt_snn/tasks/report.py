@@ -1,0 +1,278 @@
+"""What a task is taken for, and how it plays: ``check_env``, as ``switchmt-snn check-env`` prints it."""
+
+from __future__ import annotations
+
+import re
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from switchmt_snn.config import LearningConfig, TasksConfig
+from switchmt_snn.errors import TaskError
+from switchmt_snn.tasks.check import differs_from, journal
+from switchmt_snn.tasks.gym_copies import GymCopies
+from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.gym_spaces import frame_layout
+from switchmt_snn.tasks.play import Play, episode_seed
+from switchmt_snn.tasks.registry import make_suite, suite_of
+from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite
+
+COMPARED_STEPS = 200
+"""Steps that are played again to compare them."""
+THREADS = 4
+"""Threads that play at a time for the check of thread safety."""
+
+
+@dataclass(frozen=True)
+class EnvironmentReport:
+    """One task: what it is taken for, and what a random play of one copy showed.
+
+    Attributes:
+        task: its name.
+        suite: value of ``tasks.suite``.
+        observes: the observation space, as Gymnasium prints it; None outside the gym suite.
+        frame_shape: of one frame of this task in the suite, channels first.
+        frame_dtype: ``uint8`` or ``float32``.
+        layout: ``vector``, or where the channels of the environment's images are.
+        scale: factor to the network's input.
+        observed: smallest and largest raw value.
+        actions: by the environment's own numbers.
+        steps: that were played.
+        episode_lengths: of episodes that ended.
+        episode_returns: likewise.
+        truncated: how many of them were truncated.
+        rewards: smallest and largest.
+        limit_steps: longest episode that the environment allows; None if it says none.
+        repeats: whether the same seed and actions give the same play in an environment made anew.
+        starts_afresh: whether an episode is the same after other episodes as in an environment made anew.
+        seeds_differ: whether another seed gives another play.
+        draws_globally: whether it draws from (or seeds) the generators of ``random`` or ``numpy.random``.
+        played_in_threads: whether evaluations play it in several threads at a time.
+        same_in_threads: whether several threads at a time play what one plays.
+        steps_per_s: of one copy, with random actions.
+        notes: what its author should know.
+    """
+
+    task: str
+    suite: str
+    observes: str | None
+    frame_shape: tuple[int, ...]
+    frame_dtype: str
+    layout: str
+    scale: float
+    observed: tuple[float, float]
+    actions: tuple[int, ...]
+    steps: int
+    episode_lengths: tuple[int, ...]
+    episode_returns: tuple[float, ...]
+    truncated: int
+    rewards: tuple[float, float]
+    limit_steps: int | None
+    repeats: bool
+    starts_afresh: bool
+    seeds_differ: bool
+    draws_globally: bool
+    played_in_threads: bool
+    same_in_threads: bool
+    steps_per_s: float
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def check_env(
+    *names: str, suite: str = "gym", steps: int = 1000, seed: int = 0, **settings: Any
+) -> tuple[EnvironmentReport, ...]:
+    """What tasks are taken for, and how they play; in the manner of Gymnasium's checker, whose warnings are notes here.
+
+    Args:
+        names: of the tasks; together they must fit one network.
+        suite: value of ``tasks.suite``.
+        steps: of random play, with one copy of each task.
+        seed: of episodes and random actions.
+        settings: other fields of ``TasksConfig`` (``wrappers``, ``image_layout``, ...).
+
+    Raises:
+        ConfigError: no such suite or setting.
+        TaskError: training would refuse a task; names it, what was seen, and what to do.
+
+    Example:
+        >>> (report,) = check_env("CartPole-v1", steps=300)
+        >>> report.layout, report.frame_shape, report.actions, report.limit_steps, report.repeats
+        ('vector', (4,), (0, 1), 500, True)
+    """
+    config = TasksConfig(suite=suite, names=names, **settings)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tasks = make_suite(config)
+        reports = [_report(config, tasks, task, steps, seed) for task in range(len(names))]
+    heard = tuple(dict.fromkeys(_plain(str(warning.message)) for warning in caught))
+    if heard and len(reports) == 1:
+        reports[0] = replace(reports[0], notes=(*reports[0].notes, *heard))
+    return tuple(reports)
+
+
+def _report(config: TasksConfig, tasks: TaskSuite, task: int, steps: int, seed: int) -> EnvironmentReport:
+    made: list[TaskEnvironment] = []
+
+    def make(number: int, num_envs: int) -> TaskEnvironment:
+        made.append(tasks.make(number, num_envs))
+        return made[-1]
+
+    played = _Played(replace(tasks, make=make), task, steps, seed)
+    compared = min(steps, COMPARED_STEPS)
+    first = journal(tasks, task, compared, seed)
+    facts = _gym_facts(config, task)
+    actions = np.flatnonzero(tasks.valid_actions_KA[task]) + tasks.first_action(task)
+    report = EnvironmentReport(
+        task=tasks.names[task],
+        suite=suite_of(config).name,
+        observes=facts["observes"],
+        frame_shape=tasks.frame_shape,
+        frame_dtype=np.dtype(tasks.frame_dtype).name,
+        layout=facts["layout"] or ("vector" if len(tasks.frame_shape) == 1 else "channels_first"),
+        scale=tasks.scale,
+        observed=(played.low, played.high),
+        actions=tuple(actions.tolist()),
+        steps=steps,
+        episode_lengths=tuple(played.lengths),
+        episode_returns=tuple(played.returns),
+        truncated=played.truncated,
+        rewards=(min(played.rewards), max(played.rewards)),
+        limit_steps=facts["limit_steps"],
+        repeats=differs_from(first, journal(tasks, task, compared, seed)) is None,
+        starts_afresh=played.starts_afresh,
+        seeds_differ=differs_from(first, journal(tasks, task, compared, seed + 1, actions_seed=seed)) is not None,
+        draws_globally=isinstance(made[0], GymCopies) and made[0].draws_globally,
+        played_in_threads=tasks.thread_safe,
+        same_in_threads=_same_in_threads(tasks, task, compared, seed, first),
+        steps_per_s=played.steps_per_s,
+    )
+    return replace(report, notes=tuple(_notes(report, facts["bounds"])))
+
+
+class _Played:
+    """A random play of one copy."""
+
+    def __init__(self, tasks: TaskSuite, task: int, steps: int, seed: int) -> None:
+        rng, valid = np.random.default_rng(seed), np.flatnonzero(tasks.valid_actions_KA[task])
+        self.lengths: list[int] = []
+        self.returns: list[float] = []
+        self.rewards: list[float] = []
+        self.truncated, episodes, one = 0, 1, np.zeros(1, np.int64)
+        play = Play(tasks, task, 1)
+        try:
+            frames = play.begin(one, np.asarray([episode_seed(seed, task, 0)]))
+            self.low, self.high = float(frames.min()), float(frames.max())
+            started = time.perf_counter()
+            for _ in range(steps):
+                result = play.step(rng.choice(valid, 1))
+                self.low = min(self.low, float(result.frames.min()))
+                self.high = max(self.high, float(result.frames.max()))
+                self.rewards.append(float(result.rewards[0]))
+                if len(result.ended):
+                    self.lengths.append(int(play.lengths_steps[0]))
+                    self.returns.append(float(play.returns[0]))
+                    self.truncated += bool(result.truncated[0]) and not bool(result.terminated[0])
+                    play.begin(one, np.asarray([episode_seed(seed, task, episodes)]))
+                    episodes += 1
+            self.steps_per_s = steps / (time.perf_counter() - started)
+            again = _one_episode(play, valid, seed)
+        finally:
+            play.close()
+        anew = Play(tasks, task, 1)
+        try:
+            self.starts_afresh = differs_from(again, _one_episode(anew, valid, seed)) is None
+        finally:
+            anew.close()
+
+
+def _one_episode(play: Play, valid: npt.NDArray[np.int64], seed: int) -> list[tuple[npt.NDArray[Any], ...]]:
+    """The first steps of an episode of a fixed seed with fixed actions."""
+    rng = np.random.default_rng(seed)
+    seen: list[tuple[npt.NDArray[Any], ...]] = [(play.begin(np.zeros(1, np.int64), np.asarray([12345])).copy(),)]
+    for _ in range(COMPARED_STEPS // 4):
+        result = play.step(rng.choice(valid, 1))
+        seen.append((result.frames.copy(), result.rewards, result.terminated, result.truncated))
+        if len(result.ended):
+            break
+    return seen
+
+
+def _same_in_threads(tasks: TaskSuite, task: int, steps: int, seed: int, expected: Any) -> bool:
+    try:
+        with ThreadPoolExecutor(THREADS) as pool:
+            plays = list(pool.map(lambda _: journal(tasks, task, steps, seed), range(THREADS)))
+    except TaskError:
+        return False  # alone it has just played without an error
+    return all(differs_from(expected, play) is None for play in plays)
+
+
+def _gym_facts(config: TasksConfig, task: int) -> dict[str, Any]:
+    """What only a Gymnasium environment says of itself."""
+    if config.suite != "gym":
+        return {"observes": None, "layout": None, "limit_steps": None, "bounds": None}
+    env = make_environment(config.names[task], config.wrappers)
+    space = env.observation_space
+    layout = frame_layout(config.names[task], space, config.image_layout)
+    facts = {
+        "observes": " ".join(str(space).split()),
+        "layout": layout.kind,
+        "limit_steps": None if env.spec is None else env.spec.max_episode_steps,
+        "bounds": (float(np.min(space.low)), float(np.max(space.high))),  # type: ignore[attr-defined]
+    }
+    env.close()
+    return facts
+
+
+def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None) -> list[str]:
+    notes = []
+    low, high = report.observed
+    if not report.repeats:
+        notes.append(
+            "the same seed and actions do not give the same play: scores differ from one evaluation to the next, and a "
+            "resumed run is not exact; take every random number from self.np_random, which reset(seed=...) seeds"
+        )
+    elif not report.starts_afresh:
+        notes.append(
+            "an episode depends on the episodes before it: a resumed run is not exact; set everything anew in reset"
+        )
+    if report.draws_globally:
+        notes.append("it draws from the global generators; here they are seeded by the episode's seed")
+    if not report.seeds_differ:
+        notes.append("every seed gives the same play: episodes of an evaluation differ by random actions only")
+    if report.repeats and not report.same_in_threads:
+        notes.append("copies share state: several threads at a time play something else than one")
+    if not report.episode_lengths:
+        limit = "has no limit" if report.limit_steps is None else f"ends after {report.limit_steps:,} at the latest"
+        notes.append(
+            f"no episode ended in {report.steps:,} steps, and the environment {limit} (max_episode_steps); evaluations "
+            "cut episodes off after evaluation.max_episode_steps"
+        )
+    if bounds is not None and not (bounds[0] <= low and high <= bounds[1]):
+        notes.append(
+            f"observations from {low:g} to {high:g} leave the space's bounds from {bounds[0]:g} to {bounds[1]:g}"
+        )
+    if report.scale < 1 and high <= 32:
+        notes.append(
+            f"pixels up to {high:g} of 255: the network sees {high * report.scale:.2g} at most; spread them in a "
+            "wrapper (tasks.wrappers)"
+        )
+    if report.layout == "vector" and max(-low, high) > 100:
+        notes.append(f"values up to {max(-low, high):g} reach the network as they are; scale them in a wrapper")
+    largest = max(-report.rewards[0], report.rewards[1])
+    if LearningConfig.clip_rewards and largest > 1:
+        notes.append(f"rewards up to {largest:g}: learning.clip_rewards (true by default) clips them to [-1, 1]")
+    return notes
+
+
+def _plain(text: str) -> str:
+    """A warning of Gymnasium without colours and its prefix, on one line."""
+    return " ".join(re.sub(r"\x1b\[\d*m", "", text).removeprefix("WARN: ").split())

@@ -1,0 +1,131 @@
+"""``check_env``: what it says about each suite's tasks and about environments that people write."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from switchmt_snn import check_env
+from switchmt_snn.cli.entry import main
+from switchmt_snn.config import TasksConfig
+from switchmt_snn.errors import TaskError
+from switchmt_snn.tasks.check import check_before_training
+from switchmt_snn.tasks.registry import SUITES, make_suite
+from switchmt_snn.tasks.report import EnvironmentReport
+
+MODULE = "tests.tasks.odd_envs"
+
+
+def report_of(name: str, **settings: Any) -> EnvironmentReport:
+    (report,) = check_env(f"{MODULE}:{name}-v0", steps=120, **settings)
+    return report
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_every_suites_examples_repeat_themselves_in_any_thread(suite: str) -> None:
+    reports = check_env(*SUITES[suite].examples, suite=suite, steps=60)
+    assert [report.task for report in reports] == list(SUITES[suite].examples)
+    for report in reports:
+        assert report.repeats
+        assert report.starts_afresh
+        assert report.same_in_threads
+        assert report.played_in_threads
+        assert not report.draws_globally
+        assert report.steps_per_s > 0
+
+
+def test_the_facts_of_a_plain_environment() -> None:
+    report = report_of("Offset")
+    assert report.actions == (-1, 0, 1)
+    assert (report.layout, report.frame_shape, report.frame_dtype, report.scale) == ("vector", (4,), "float32", 1.0)
+    assert report.observed == (0.0, pytest.approx(3.0))
+    assert report.episode_lengths == (30, 30, 30, 30)
+    assert (report.truncated, report.limit_steps, report.rewards) == (0, None, (0.0, 1.0))
+    assert not report.played_in_threads
+    assert report.same_in_threads
+    assert report.notes == ("every seed gives the same play: episodes of an evaluation differ by random actions only",)
+
+
+@pytest.mark.parametrize(
+    ("name", "note"),
+    [
+        ("OwnUnseeded", "the same seed and actions do not give the same play"),
+        ("SharedState", "the same seed and actions do not give the same play"),
+        ("KeepsState", "an episode depends on the episodes before it"),
+        ("GlobalRandom", "it draws from the global generators"),
+        ("GlobalRandom", r"rewards up to \S+: learning\.clip_rewards"),
+        ("Endless", "no episode ended in 120 steps, and the environment has no limit"),
+        ("Endless", "observations from 0 to 12 leave the space's bounds from -10 to 10"),
+        ("Large", "values up to 3000 reach the network as they are"),
+        ("FaintImage", "pixels up to 10 of 255"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_what_an_author_should_know_is_a_note(name: str, note: str) -> None:
+    import re
+
+    assert any(re.match(note, text) for text in report_of(name).notes), report_of(name).notes
+
+
+def test_drawing_from_global_generators_is_seen_and_does_not_keep_play_from_repeating() -> None:
+    report = report_of("GlobalRandom")
+    assert report.draws_globally
+    assert report.repeats
+    assert not report_of("Plain").draws_globally
+
+
+def test_warnings_of_gymnasiums_checker_are_notes() -> None:
+    notes = report_of("DoubleObservation").notes
+    assert any("was expecting a numpy array" in note and "\x1b" not in note for note in notes)
+
+
+def test_what_training_would_refuse_is_refused() -> None:
+    with pytest.raises(TaskError, match="gave the rewards"):
+        report_of("NanReward")
+    with pytest.raises(TaskError, match="FlattenAction"):
+        report_of("Combined")
+    assert report_of("Combined", wrappers=("FlattenAction",)).actions == tuple(range(6))
+
+
+def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["check-env", f"{MODULE}:ChannelsFirst-v0", "--steps", "40"]
+    with pytest.raises(SystemExit) as done:
+        main(words)
+    assert done.value.code == 0
+    text = capsys.readouterr().out
+    assert "can be trained" in text
+    assert "images, channels first: frames of 4 channels, 10 x 10" in text
+    assert "0 to 2" in text
+    with pytest.raises(SystemExit):
+        main([*words, "--json"])
+    (facts,) = json.loads(capsys.readouterr().out)
+    assert facts["layout"] == "channels_first"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "was given no environment"),
+        ([f"{MODULE}:FloatGrid-v0"], "tasks.wrappers=[FlattenObservation]"),
+        (["Nothing-v0"], "unknown Gymnasium id"),
+        (["CartPole-v1", "--steps", "0"], "--steps is 0"),
+    ],
+)
+def test_the_command_refuses_in_one_line(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit) as done:
+        main(["check-env", *words])
+    assert done.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_run_says_before_it_starts_that_an_environment_does_not_repeat_itself() -> None:
+    config = TasksConfig(suite="gym", names=(f"{MODULE}:Plain-v0", f"{MODULE}:OwnUnseeded-v0"))
+    (note,) = check_before_training(config, make_suite(config))
+    assert note.startswith(f"warning: task '{MODULE}:OwnUnseeded-v0' differs at step ")
