@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from switchmt_snn.cli.parsing import leading_names, parse
+from switchmt_snn.cli.parsing import parse, split
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.runs.files import json_text
 
@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CheckEnvOptions:
-    """check-env ID [ID ...]: what environments are taken for, how they play, and why training would refuse them.
-    Several IDs must fit one network."""
+    """What environments are taken for, how they play, and why training would refuse them."""
 
     suite: str = "gym"
     """As tasks.suite: gym (Gymnasium ids, also module:MyEnv-v0), atari, minatar, or module:MySuite."""
@@ -32,7 +31,7 @@ class CheckEnvOptions:
 
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
-    names, rest = leading_names(argv)
+    names, rest = split(CheckEnvOptions, argv, "check-env", CheckEnvOptions())
     options = parse(CheckEnvOptions, rest, "check-env", CheckEnvOptions())
     if not names:
         raise ConfigError("check-env was given no environment, expected one: switchmt-snn check-env CartPole-v1")

@@ -19,6 +19,7 @@ ARGUMENTS = {
     "evaluate": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "profile": ("RUN", "run folders, or NIR files (default: the run under runs/ that was begun last)"),
+    "check-env": ("ID", "names of environments; several must fit one network"),
     "doctor": ("", ""),
 }
 """The positional argument of each command, and what it is."""
