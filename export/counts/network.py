@@ -166,7 +166,7 @@ class TaskCounts:
             "rate": self.rate,
             "twins": {
                 "ann": {"macs": macs},
-                "quantised_ann": {"macs": macs, "activation_bits": self.activation_bits},
+                "quantised_ann": {"macs": macs, "activation_bits": self.activation_bits} if self.spiking else None,
             },
             "layers": [layer.to_dict() for layer in self.layers],
         }

@@ -91,7 +91,8 @@ class Energy:
         not_included: what was counted and has no price, in words.
         ann_pj: compute and memory of the ANN twin; None where the target cannot multiply.
         quantised_ann_pj: of the quantised twin: where the ANN's inputs are activations, one addition per activation bit
-            and weight, if that is cheaper than a multiplication, and activations of that many bits in memory.
+            and weight, if that is cheaper than a multiplication, and activations of that many bits in memory. None also
+            where the network is an ANN, whose activations have no number of bits.
     """
 
     target: str
@@ -158,7 +159,7 @@ def estimate(task: TaskCounts, target: Target) -> Energy:
         not_included=tuple(unpriced),
         has_memory=target.memory is not None,
         ann_pj=_ann_pj(task, target),
-        quantised_ann_pj=_ann_pj(task, target, quantised=True),
+        quantised_ann_pj=_ann_pj(task, target, quantised=True) if task.spiking else None,
     )
 
 

@@ -120,12 +120,16 @@ def parity_table(parity: dict[str, Any]) -> Table:
 def profile_table(task: dict[str, Any]) -> Table:
     """What a network does per decision in one task, layer by layer (an entry of ``tasks`` in profile.json)."""
     mean, twin = task["per_decision"], task["twins"]["ann"]["macs"]
-    facts = [f"{mean['acs']:,.0f} accumulations and {mean['macs']:,.0f} multiplications; the ANN twin multiplies"]
-    facts.append(f"{twin:,} times.")
-    if mean["neuron_updates"]:
-        facts.append(f"{mean['spikes']:,.0f} spikes, {task['spikes_per_synapse']:.3f} per synapse.")
+    spiking = bool(mean["neuron_updates"])
+    if spiking:
+        facts = [f"{mean['acs']:,.0f} accumulations and {mean['macs']:,.0f} multiplications; the ANN twin multiplies"]
+        facts.append(f"{twin:,} times. {mean['spikes']:,.0f} spikes, {task['spikes_per_synapse']:.3f} per synapse.")
+    else:
+        facts = [f"{mean['macs']:,.0f} multiplications of inputs that are not zero, of {twin:,} in all."]
+        facts.append(f"{mean['spikes']:,.0f} active units (above zero).")
     table = _table(f"{task['task']}: per decision, mean of {task['decisions']:,}", " ".join(facts))
-    _add_columns(table, ("layer", "kind"), ("effective", "dense", "neurons", "rate", "silent", "saturated"))
+    share = "rate" if spiking else "active"
+    _add_columns(table, ("layer", "kind"), ("effective", "dense", "neurons", share, "silent", "saturated"))
     for layer in task["layers"]:
         counts = (f"{layer['effective_per_decision']:,.0f}", f"{layer['dense_per_decision']:,}")
         neurons = (f"{layer['neurons']:,}", f"{layer['rate']:.4f}", f"{layer['silent']:,}", f"{layer['saturated']:,}")
@@ -136,22 +140,26 @@ def profile_table(task: dict[str, Any]) -> Table:
 def energy_table(profile: dict[str, Any]) -> Table:
     """Energy per decision by target and task (the content of profile.json)."""
     tasks = profile["tasks"]
+    ratios = {"x ANN": "by_ann", "x QANN": "by_quantised_ann"} if profile["spiking"] else {"x dense": "by_ann"}
+    meaning = (
+        "x ANN: by the ANN of the same shape on the same target, the task with the most; x QANN: by the same with "
+        "activations of few bits; above 1 the spiking network costs more."
+        if profile["spiking"]
+        else "x dense: by the same ANN if no zero saves anything, the task with the most."
+    )
     table = _table(
         "Energy per decision in µJ: compute, and memory where the target has a memory model",
-        "x ANN: by the ANN of the same shape on the same target, the task with the most; x QANN: by the same with "
-        "activations of few bits; above 1 the spiking network costs more. * something counted has no price there "
-        "(report.html says what, and what each target leaves out). How: est(imated), sim(ulated), rep(orted), "
-        "mea(sured).",
+        f"{meaning} * something counted has no price there (report.html says what, and what each target leaves out). "
+        "How: est(imated), sim(ulated), rep(orted), mea(sured).",
     )
-    _add_columns(table, ("target", "how"), (*(task["task"] for task in tasks), "x ANN", "x QANN"))
+    _add_columns(table, ("target", "how"), (*(task["task"] for task in tasks), *ratios))
     for index, target in enumerate(profile["targets"].values()):
         rows = [task["energy"][index] for task in tasks]
         cells = [f"{_three_digits(row['total_pj'] / 1e6)}{'*' if row['not_included'] else ''}" for row in rows]
-        ratios = []
-        for twin in ("by_ann", "by_quantised_ann"):
+        for twin in ratios.values():
             known = [row[twin] for row in rows if row[twin] is not None]
-            ratios.append(f"{max(known):.2f}" if known else "")
-        table.add_row(target["name"], target["evidence"][:3] + ".", *cells, *ratios)
+            cells.append(f"{max(known):.2f}" if known else "")
+        table.add_row(target["name"], target["evidence"][:3] + ".", *cells)
     return table
 
 
@@ -190,14 +198,17 @@ def comparison_table(profiles: list[dict[str, Any]]) -> Table:
     table.add_column("")
     for profile in profiles:
         table.add_column(profile["run"], justify="right")
-    for label, key, unit in (
-        ("spikes", "spikes", 1.0),
-        ("per neuron and step", "rate", 1.0),
-        ("energy (µJ)", "total_pj", 1e6),
-        ("x ANN", "by_ann", 1.0),
-        ("x QANN", "by_quantised_ann", 1.0),
+    for label, key, unit, kinds in (
+        ("spikes", "spikes", 1.0, (True,)),
+        ("per neuron and step", "rate", 1.0, (True,)),
+        ("active units (ANN)", "spikes", 1.0, (False,)),
+        ("energy (µJ)", "total_pj", 1e6, (True, False)),
+        ("x ANN", "by_ann", 1.0, (True, False)),
+        ("x QANN", "by_quantised_ann", 1.0, (True,)),
     ):
-        table.add_row(label, *(_span(profile["summary"][key], unit) for profile in profiles))
+        if any(profile["spiking"] in kinds for profile in profiles):
+            cells = (_span(one["summary"][key], unit) if one["spiking"] in kinds else "" for one in profiles)
+            table.add_row(label, *cells)
     return table
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
@@ -12,9 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from switchmt_snn import train
+from switchmt_snn.config import from_dict
 from switchmt_snn.export import profile
 from switchmt_snn.export.report.page import FILTERS, render_report
+from switchmt_snn.viewing.tables import comparison_table, energy_table, profile_table
 from tests.export.export_cases import RunCommand
 
 TEMPLATE = Path(__file__).parents[2] / "export" / "report" / "templates" / "report.html.jinja"
@@ -166,3 +171,52 @@ def test_nothing_is_cut_in_a_browser(profiled: Path, width: int) -> None:
         assert page.evaluate(outside) == []
         browser.close()
     assert messages == []
+
+
+@pytest.fixture(scope="module")
+def ann_and_spiking(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """Profiles of an ANN and of a spiking network on CartPole."""
+    folder, found = tmp_path_factory.mktemp("ann"), []
+    for method in ("DQN", "SwitchMT"):
+        data: dict[str, Any] = {
+            "total_steps": 60,
+            "threads": 1,
+            "tasks": {"suite": "gym", "names": ["CartPole-v1", "Acrobot-v1"]},
+            "network": {"method": method, "hidden_units": 8},
+            "learning": {"batch_size": 8, "learning_starts_steps": 20, "replay_capacity_steps": 100},
+            "evaluation": {"episodes": 1},
+        }
+        train(from_dict(data), folder / method)
+        found.append(profile(folder / method, 20).facts)
+    return found
+
+
+def words_of(facts: dict[str, Any]) -> str:
+    """The visible text of a report, without what targets say of themselves."""
+    page = Page(render_report([facts], [[np.zeros((0, 4), np.float32)] * 2], "command"))
+    return " ".join(line for line in page.text if not re.search(r"pJ|Source:|Memory after|Neuron updates cost", line))
+
+
+def test_the_report_of_an_ann_speaks_of_no_spikes(ann_and_spiking: list[dict[str, Any]]) -> None:
+    ann, spiking = map(words_of, ann_and_spiking)
+    for word in ("spike", "Spikes", "fired", "Firing", "simulation step", "1 bits", "break-even", "quantised"):
+        assert word not in ann, ann[max(0, ann.index(word) - 80) : ann.index(word) + 80]
+    for word in ("spikes", "Firing rates", "simulation steps", "break-even", "quantised ANN"):
+        assert word in spiking
+    facts = ann_and_spiking[0]
+    assert facts["tasks"][0]["twins"]["quantised_ann"] is None
+    assert {row["by_quantised_ann"] for task in facts["tasks"] for row in task["energy"]} == {None}
+
+
+def test_the_tables_of_an_ann_speak_of_no_spikes(ann_and_spiking: list[dict[str, Any]]) -> None:
+    ann, spiking = ann_and_spiking
+    console = Console(file=(stream := io.StringIO()), width=100)
+    for table in (profile_table(ann["tasks"][0]), energy_table(ann), comparison_table([ann])):
+        console.print(table)
+    assert not [word for word in ("spik", "twin", "QANN", "step") if word in stream.getvalue().split("Energy per")[0]]
+    assert "QANN" not in stream.getvalue()
+    assert "active units (ANN)" in stream.getvalue()
+    columns = comparison_table([ann, spiking]).columns
+    cells = {label: (one, two) for label, one, two in zip(*(column.cells for column in columns), strict=True)}
+    assert cells["spikes"][0] == "" != cells["spikes"][1]
+    assert cells["active units (ANN)"][0] != "" == cells["active units (ANN)"][1]
