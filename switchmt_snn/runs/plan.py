@@ -79,7 +79,7 @@ def plan(
     if is_plugin(config.switching.policy):
         check_policy(config.switching)
     suite = make_suite(config.tasks)
-    warnings = check_before_training(config.tasks, suite)
+    warnings = check_before_training(config.tasks, suite, config.learning.clip_rewards)
     if is_plugin(config.network.encoding):
         try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)
     config, notes = decide(config, stored, suite, device, processes)

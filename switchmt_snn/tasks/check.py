@@ -15,15 +15,16 @@ STEPS_BEFORE_TRAINING = 20
 """Steps per task for which tasks from outside are played before a run starts."""
 
 
-def check_before_training(config: TasksConfig, tasks: TaskSuite) -> tuple[str, ...]:
+def check_before_training(config: TasksConfig, tasks: TaskSuite, clips_rewards: bool) -> tuple[str, ...]:
     """Play tasks from outside the package for a few steps, twice; a suite must repeat itself, as in ``check_suite``.
 
     Args:
         config: names the suite.
         tasks: what ``make_suite(config)`` returned.
+        clips_rewards: ``learning.clip_rewards``.
 
     Returns:
-        what the user should know: Gymnasium environments that do not repeat themselves.
+        what the user should know: Gymnasium environments that do not repeat themselves, or whose rewards are clipped.
 
     Raises:
         TaskError: naming the task, what was seen, and what was expected.
@@ -33,7 +34,15 @@ def check_before_training(config: TasksConfig, tasks: TaskSuite) -> tuple[str, .
         check_suite(tasks, STEPS_BEFORE_TRAINING)
     elif config.suite == "gym":
         for task, name in enumerate(tasks.names):
-            step = differs_from(*(journal(tasks, task, STEPS_BEFORE_TRAINING) for _ in range(2)))
+            first, second = (journal(tasks, task, STEPS_BEFORE_TRAINING) for _ in range(2))
+            largest = max(float(np.abs(seen[1]).max()) for seen in first[1:])
+            if clips_rewards and largest > 1:
+                notes.append(
+                    f"warning: task {name!r} gave rewards up to {largest:g}, and learning.clip_rewards=true clips them "
+                    "to [-1, 1] for learning, which changes what is best; learning.clip_rewards=false learns from them "
+                    "as they are (a Huber loss or smaller rewards then help)"
+                )
+            step = differs_from(first, second)
             if step is not None:
                 notes.append(
                     f"warning: task {name!r} differs at step {step} when it is played again with the same seed and "

@@ -44,12 +44,13 @@ class Progress:
         self._returns: list[deque[float]] = [deque(maxlen=RETURN_WINDOW_EPISODES) for _ in training.suite.names]
         self._speed = Speed(time.monotonic(), training.steps)
         config = training.config
-        network, skip = config.network, suite_of(config.tasks).frame_skip
+        network, suite = config.network, suite_of(config.tasks)
+        frames = f" ({config.total_steps * suite.frame_skip:,} emulator frames)" if suite.frames_per_s else ""
         where = f"continuing {folder.path} at step {resumed_at:,}" if resumed_at is not None else f"run {folder.path}"
         self.console.print(
             f"{where}: {network.method} on {', '.join(training.suite.names)}, T={network.timesteps}, "
             f"{network.encoding} encoding, switching {config.switching.policy}, "
-            f"{config.total_steps:,} agent steps ({config.total_steps * skip:,} emulator frames), "
+            f"{config.total_steps:,} agent steps{frames}, "
             f"{training.learner.device}",
             highlight=False,
             soft_wrap=True,

@@ -127,5 +127,16 @@ def test_the_command_refuses_in_one_line(
 
 def test_a_run_says_before_it_starts_that_an_environment_does_not_repeat_itself() -> None:
     config = TasksConfig(suite="gym", names=(f"{MODULE}:Plain-v0", f"{MODULE}:OwnUnseeded-v0"))
-    (note,) = check_before_training(config, make_suite(config))
+    (note,) = check_before_training(config, make_suite(config), True)
     assert note.startswith(f"warning: task '{MODULE}:OwnUnseeded-v0' differs at step ")
+
+
+def test_a_run_says_before_it_starts_that_it_clips_rewards() -> None:
+    """Clipping is Atari's custom: elsewhere it can change what is best."""
+    config = TasksConfig(suite="gym", names=(f"{MODULE}:Plain-v0", f"{MODULE}:LargeRewards-v0"))
+    tasks = make_suite(config)
+    (note,) = check_before_training(config, tasks, clips_rewards=True)
+    assert note.startswith(
+        f"warning: task '{MODULE}:LargeRewards-v0' gave rewards up to 100, and learning.clip_rewards"
+    )
+    assert check_before_training(config, tasks, clips_rewards=False) == ()

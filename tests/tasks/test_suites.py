@@ -264,9 +264,9 @@ class OtherCount(CountingEnvironment):
 def test_a_mistake_in_an_environment_is_one_line_before_training(make, message, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     config = TasksConfig(suite="tests.tasks.test_suites:Counting", names=("a", "b"))
     tasks = make_suite(config)
-    check_before_training(config, tasks)
+    check_before_training(config, tasks, True)
     with pytest.raises(TaskError, match=message) as caught:
-        check_before_training(config, replace(tasks, make=make))
+        check_before_training(config, replace(tasks, make=make), True)
     assert "task 'a'" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -321,10 +321,10 @@ def test_a_gymnasium_environment_is_compared_with_its_declaration(environment, m
     gymnasium.register(name, environment, max_episode_steps=4)
     config = TasksConfig(suite="gym", names=(name,))
     if message is None:
-        check_before_training(config, make_suite(config))
+        check_before_training(config, make_suite(config), True)
         return
     with pytest.raises(TaskError, match=message):
-        check_before_training(config, make_suite(config))
+        check_before_training(config, make_suite(config), True)
 
 
 def test_a_module_that_registers_nothing_is_told_to() -> None:
