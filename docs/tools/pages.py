@@ -17,10 +17,11 @@ import numpy as np
 
 from docs.tools.atari_page import atari_page
 from docs.tools.cartpole_page import cartpole_page
-from docs.tools.commands import commands
+from docs.tools.commands import commands, repeating
 from docs.tools.energy_page import energy_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
+from docs.tools.profile_spread import spread
 from docs.tools.recipe_page import recipe_page
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import field_documentation, load_config
@@ -319,7 +320,7 @@ def profile_page() -> str:
             "",
             facts["headline"],
             "",
-            f"Command: `{facts['command']}`.",
+            f"Command: `{facts['command']}`; the run: `{repeating(path.parent)}`.",
             "",
             "| task | decisions | spikes | accumulations | multiplications | ANN multiplications "
             "| spikes per neuron and step | same action with 8-bit weights |",
@@ -332,6 +333,7 @@ def profile_page() -> str:
                 f"{mean['macs']:,.0f} | {task['twins']['ann']['macs']:,} | {task['rate']:.3f} | "
                 f"{task['precision'][0]['equal_actions_share']:.1%} |"
             )
+        lines += spread(path.parent.name, {t["task"]: t["precision"][0]["equal_actions_share"] for t in facts["tasks"]})
         lines += ["", "| target | " + " | ".join(f"{task['task']} (µJ)" for task in facts["tasks"]) + " | by the ANN |"]
         lines.append("|---" * (len(facts["tasks"]) + 2) + "|")
         for index, target in enumerate(facts["targets"]):
