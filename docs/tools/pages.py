@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from docs.tools.atari_page import atari_page
-from docs.tools.cartpole_page import cartpole_page
 from docs.tools.commands import commands, repeating
+from docs.tools.control_page import cartpole_page, classic_page
 from docs.tools.energy_page import energy_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
@@ -45,8 +45,9 @@ def configuration_page() -> str:
         "agent steps: one decision, `tasks.frame_skip` emulator frames in Atari.",
         "",
         "Presets: `quickstart` (the default of `train`), `paper` (the paper's text), `released` (the authors' script),",
-        "`cartpole` (learns in a minute), `minatar` (three small games that learn on a CPU), `strong` (three Atari",
-        "games on a CPU in an afternoon; being measured, results/atari), `fast` (for a GPU; not run on one yet).",
+        "`cartpole` (learns in a minute), `classic` (CartPole and Acrobot in one network, some minutes), `minatar`",
+        "(three small games that learn on a CPU), `strong` (three Atari games on a CPU in an afternoon; being",
+        "measured, results/atari), `fast` (for a GPU; not run on one yet).",
         "`docs/algorithm.md` says where the presets come from.",
     ]
     for prefix, text, rows in field_documentation():
@@ -356,6 +357,7 @@ PAGES = {
     "results/recipe/README.md": recipe_page,
     "results/atari/README.md": atari_page,
     "results/cartpole/README.md": cartpole_page,
+    "results/classic/README.md": classic_page,
     "docs/performance.md": performance_page,
     "docs/picture.svg": picture,
 }

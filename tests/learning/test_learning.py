@@ -1,4 +1,4 @@
-"""That a spiking network learns a task, with the preset that users try first."""
+"""That a spiking network learns, with the presets that users try first."""
 
 from __future__ import annotations
 
@@ -20,4 +20,18 @@ def test_the_cartpole_preset_learns_to_balance(tmp_path: Path) -> None:
     trained, random = (result.evaluation.score("CartPole-v1", policy) for policy in ("agent", "random"))
     assert random.mean < 30.0
     assert trained.mean > 180.0  # other episodes than those that reached 230
+    assert result.step < config.total_steps
+
+
+@pytest.mark.slow
+def test_the_classic_preset_learns_both_tasks_in_one_network(tmp_path: Path) -> None:
+    """A shorter form: five times random CartPole, and half of random Acrobot (every episode -500)."""
+    config = load_config("classic")
+    shorter = replace(config.evaluation, stop_at_returns=(110.0, -250.0), every_steps=4000, episodes=50)
+    result = train(replace(config, evaluation=shorter), tmp_path / "run")
+    assert result.evaluation is not None
+    trained = {name: result.evaluation.score(name).mean for name in config.tasks.names}
+    assert result.evaluation.score("Acrobot-v1", "random").mean < -490.0
+    assert trained["CartPole-v1"] > 80.0  # other episodes than those that ended the training
+    assert trained["Acrobot-v1"] > -300.0
     assert result.step < config.total_steps
