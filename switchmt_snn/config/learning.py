@@ -45,6 +45,12 @@ class LearningConfig:
     torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for Atari-size
     networks and long runs on vectors, if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or
     more; else eager."""
+    acting_network: Literal["online", "target"] = "online"
+    """By whose Q-values training acts: Q's, or those of Q*, whose weights stay with their BatchNorm statistics from one
+    copy to the next."""
+    next_statistics: Literal["running", "batch"] = "running"
+    """What BatchNorm normalizes the next states by, in Q* and in the choice of Q: running statistics, which lag behind
+    Q's weights, or those of the batch, as in the pass that is trained."""
     acting: Literal["auto", "eager", "native"] = "auto"
     """Who computes the actions of training. eager: PyTorch in float32. native: the native engine, in the precision of
     its updates. Evaluation is always eager. auto: native with engine native, else eager."""

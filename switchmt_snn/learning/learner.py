@@ -93,8 +93,8 @@ CLIPS: dict[str, Callable[[list[Parameter], float], object]] = {
 class Learner(Stateful):
     """Owns the online network Q, the target network Q*, the optimizer and the engine.
 
-    Q(s, a) is computed in training mode (batch statistics); the target and the choice of its action in eval mode, with
-    the running statistics of the batch's task.
+    Q(s, a) is computed in training mode (batch statistics); the target and the choice of its action with what
+    ``learning.next_statistics`` says: the running statistics of the batch's task, or the batch's own.
 
     Attributes:
         first_layer: sets the first layer's running means; None with ``learning.first_layer_mean=running``.
@@ -179,8 +179,8 @@ class Learner(Stateful):
         return self.engine.decisions
 
     def _eager_decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
-        self.network.eval()
-        return cast(Tensor, self.network(observations, task, generator=generator))
+        network = self.target if self.config.acting_network == "target" else self.network
+        return cast(Tensor, network.eval()(observations, task, generator=generator))
 
     def act(self, observations: npt.NDArray[np.generic], task: int) -> npt.NDArray[np.int64]:
         """Greedy actions ``[B]`` for raw stacked observations ``[B, ...]`` of a task (eval mode)."""

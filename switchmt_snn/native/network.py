@@ -11,7 +11,7 @@ of all streams, A actions, M quantiles, O outputs of the heads (one per quantile
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,10 @@ Backward = Callable[[Tensor], list[Tensor]]
 
 _FEW_LANES = 32
 """T * B up to which dense products of the streams are faster than those of bits (16 lanes: 0.6 and 3.0 ms)."""
+
+
+Statistics = Literal["running", "batch", "moving"]
+"""What BatchNorm normalizes by: the running statistics, the batch's, or the batch's while the running ones move."""
 
 
 class TaskParameters(NamedTuple):
@@ -131,32 +135,39 @@ class NativeNetwork:
         """
         dense: Form | None = "dense" if self._neurons.timesteps * x.shape[1] <= _FEW_LANES else None
         with torch.no_grad():
-            features = self._features(x, parameters, training=False, last=dense)
+            features = self._features(x, parameters, "running", last=dense)
             (y_TBN,), _ = connected([features], self._streams)
-            currents = self._stream_currents(y_TBN, parameters, training=False)
+            currents = self._stream_currents(y_TBN, parameters, "running")
             spikes_SBN, _ = self._neurons.fire(y_TBN, currents, self._last_form)
             output_SBA = parameters.heads.means(spikes_SBN)
         return self._over_steps(output_SBA[0] if self._is_mean else output_SBA)
 
     def decide(
-        self, x: Tensor, parameters: TaskParameters, training: bool, other_inputs: Sequence[Tensor] = ()
+        self,
+        x: Tensor,
+        parameters: TaskParameters,
+        training: bool,
+        other_inputs: Sequence[Tensor] = (),
+        statistics: Statistics = "running",
     ) -> list[Tensor]:
         """Values of several inputs at once, which shares products with the streams' weights.
 
         Args:
-            x: of ``inputs``; normalized by the batch if ``training``, and then its values have a gradient.
+            x: of ``inputs``; if ``training``, normalized by the batch, and then its values have a gradient.
             parameters: of ``for_task``.
             training: see ``x``.
-            other_inputs: of ``inputs``; normalized by the running statistics, their Q-values have no gradient.
+            other_inputs: of ``inputs``; their Q-values have no gradient.
+            statistics: what normalizes all but a training ``x``.
 
         Returns:
             ``[B, A]``, or ``[B, M, A]`` with several quantiles, for ``x``; Q-values ``[B, A]`` for each other input.
         """
         if training and torch.is_grad_enabled():
-            outputs = _Decision.apply(self, x, parameters, other_inputs, *self._differentiated)  # type: ignore[no-untyped-call]
+            outputs = _Decision.apply(self, x, parameters, other_inputs, statistics, *self._differentiated)  # type: ignore[no-untyped-call]
         else:
+            of_x: Statistics = "moving" if training else statistics
             with torch.no_grad():
-                outputs, _ = self._outputs(x, parameters, training, other_inputs, None)
+                outputs, _ = self._outputs(x, parameters, of_x, other_inputs, statistics, None)
         values, *others = (self._over_steps(output) for output in outputs)
         quantiles = self._network.config.quantiles
         return [values if quantiles == 1 else values.unflatten(-1, (quantiles, -1)), *others]
@@ -172,8 +183,9 @@ class NativeNetwork:
         self,
         x: Tensor,
         parameters: TaskParameters,
-        training: bool,
+        of_x: Statistics,
         other_inputs: Sequence[Tensor],
+        of_others: Statistics,
         layers: list[Gradients] | None,
     ) -> tuple[list[Tensor], Backward]:
         """Outputs of the heads, ``[B, O]`` (``mean`` readout) or ``[T, B, O]``, and the backward of the first ones.
@@ -183,11 +195,11 @@ class NativeNetwork:
         Each trunk layer's backward is appended to ``layers``, which the returned function empties from the end.
         """
         # Others first: training moves the running statistics.
-        others = [self._features(other, parameters, training=False) for other in other_inputs]
-        ys, of_streams = connected([self._features(x, parameters, training, layers), *others], self._streams)
+        others = [self._features(other, parameters, of_others) for other in other_inputs]
+        ys, of_streams = connected([self._features(x, parameters, of_x, layers), *others], self._streams)
         # Others first here, too.
-        currents = [self._stream_currents(y_TBN, parameters, training=False) for y_TBN in ys[1:]]
-        currents = [self._stream_currents(ys[0], parameters, training), *currents]
+        currents = [self._stream_currents(y_TBN, parameters, of_others) for y_TBN in ys[1:]]
+        currents = [self._stream_currents(ys[0], parameters, of_x), *currents]
         fired = [self._neurons.fire(y, current, self._last_form) for y, current in zip(ys, currents, strict=True)]
         # The backward keeps only the first input's activations alive, and not its own outputs.
         y_TBN, (spikes_SBN, currents_4N), heads = ys[0], fired[0], parameters.heads
@@ -218,7 +230,7 @@ class NativeNetwork:
 
         return [output_SBO[0] if self._is_mean else output_SBO for output_SBO in outputs], backward
 
-    def _stream_currents(self, y_TBN: Tensor, parameters: TaskParameters, training: bool) -> Currents:
+    def _stream_currents(self, y_TBN: Tensor, parameters: TaskParameters, statistics: Statistics) -> Currents:
         """How the streams' currents come from their products: the gain, of the normalized product if that is set."""
         if not self._stream_norms:
             return Currents(parameters.gain_N)
@@ -227,7 +239,9 @@ class NativeNetwork:
         mean_N, variance_N = (
             torch.cat(parts) for parts in zip(*(norm.statistics(task) for norm in norms), strict=True)
         )
-        if training:
+        if statistics == "batch":
+            mean_N, variance_N = batch_moments(y_TBN)
+        elif statistics == "moving":
             moved = mean_N, variance_N
             mean_N, variance_N = batch_moments(y_TBN, moved, norms[0].momentum)
             sizes = [len(norm.weight) for norm in norms]
@@ -241,7 +255,7 @@ class NativeNetwork:
         self,
         x: Tensor,
         parameters: TaskParameters,
-        training: bool,
+        statistics: Statistics,
         layers: list[Gradients] | None = None,
         last: Form | None = None,
     ) -> Spikes:
@@ -252,7 +266,7 @@ class NativeNetwork:
         spikes = Spikes(x, x.shape[-1])
         for number, (name, layer) in enumerate(self._trunk.items(), start=1):
             form = last if number == len(self._trunk) else None
-            spikes, gradients = layer.fire(spikes, parameters.context[name], training, form)
+            spikes, gradients = layer.fire(spikes, parameters.context[name], statistics, form)
             if layers is not None:
                 layers.append(gradients)
         return spikes
@@ -275,7 +289,7 @@ class _Layer:
             self._currents = Currents(weight_C, bias_C, epsilon=self._normalization.epsilon)
 
     def fire(
-        self, x: Spikes, context: tuple[Tensor, ...], training: bool, form: Form | None = None
+        self, x: Spikes, context: tuple[Tensor, ...], statistics: Statistics, form: Form | None = None
     ) -> tuple[Spikes, Gradients]:
         """Spikes ``[T, B, h, w, C]`` or ``[T, B, C]``; and the backward, to ``x`` and the parameters.
 
@@ -290,8 +304,9 @@ class _Layer:
         y_SRC = y.flatten(1, -2)
         if normalization is not None:
             mean_C, var_C = context
-            if training:
-                mean_C, var_C = batch_moments(y_SRC, (mean_C, var_C), normalization.momentum)
+            if statistics != "running":
+                moved = (mean_C, var_C) if statistics == "moving" else None
+                mean_C, var_C = batch_moments(y_SRC, moved, normalization.momentum)
             currents = currents._replace(mean_C=mean_C, variance_C=var_C)
         values, currents_4C = neurons.fire(y_SRC, currents, form)
 
@@ -313,9 +328,10 @@ class _Decision(torch.autograd.Function):
         x: Tensor,
         task_parameters: TaskParameters,
         other_inputs: Sequence[Tensor],
+        statistics: Statistics,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
-        outputs, ctx.network_backward = network._outputs(x, task_parameters, True, other_inputs, [])
+        outputs, ctx.network_backward = network._outputs(x, task_parameters, "moving", other_inputs, statistics, [])
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[1:])
         return tuple(outputs)
@@ -323,4 +339,4 @@ class _Decision(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, None, None, *ctx.network_backward(gradients[0])
+        return None, None, None, None, None, *ctx.network_backward(gradients[0])

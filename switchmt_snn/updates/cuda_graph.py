@@ -31,7 +31,7 @@ class CudaGraph(Engine):
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
         super().__init__(network, target, config)
         differentiated = DifferentiatedPass(network, self.precision)
-        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q, compile_whole)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config, compile_whole)
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:

@@ -21,7 +21,7 @@ class Eager(Engine):
     def __init__(self, network: QNetwork, target: QNetwork, config: LearningConfig) -> None:
         super().__init__(network, target, config)
         differentiated = DifferentiatedPass(network, self.precision)
-        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config)
 
     @classmethod
     def pays(cls, config: ExperimentConfig, device: torch.device, precision: str) -> bool:

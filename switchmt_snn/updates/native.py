@@ -80,19 +80,20 @@ class Native(Engine):
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
         """See ``Engine.values``. The choice of the next action shares products with the differentiated pass."""
         online, target, double_q = self._online, self._target, self.config.double_q
+        by = self.config.next_statistics
         x_next = target.inputs(next_observations, generator)
         with torch.no_grad():
-            (next_values,) = target.decide(x_next, target.for_task(task), training=False)
+            (next_values,) = target.decide(x_next, target.for_task(task), training=False, statistics=by)
         if double_q and self.network.encoder.is_random:
             x_next = online.inputs(next_observations, generator)
         x, others = online.inputs(observations, generator), [x_next] if double_q else []
-        values, *choice = online.decide(x, online.for_task(task), training=True, other_inputs=others)
+        values, *choice = online.decide(x, online.for_task(task), training=True, other_inputs=others, statistics=by)
         return Values(values, next_values, *(choice or [self.target.expected(next_values)]))
 
     def decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
         """See ``Engine.decisions``."""
-        online = self._online
-        return online.act(online.inputs(observations, generator), online.for_task(task))
+        network = self._target if self.config.acting_network == "target" else self._online
+        return network.act(network.inputs(observations, generator), network.for_task(task))
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Adam in C++, which also writes the weights' rounded copies."""

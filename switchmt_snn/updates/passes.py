@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from switchmt_snn.config import LearningConfig
 from switchmt_snn.spiking.network import Context, QNetwork
 from switchmt_snn.updates.protocol import Values
 
@@ -39,7 +40,7 @@ def forward_passes(
     target: QNetwork,
     differentiated: nn.Module,
     precision: torch.dtype | None,
-    double_q: bool,
+    config: LearningConfig,
     compile_: Callable[[Encoded], Encoded] | None = None,
 ) -> Passes:
     """The forward passes of an update.
@@ -49,19 +50,21 @@ def forward_passes(
         target: Q*; likewise.
         differentiated: the pass that has a gradient; see ``DifferentiatedPass``.
         precision: see ``synaptic_products``.
-        double_q: whether Q chooses the next action.
+        config: says whether Q chooses the next action, and what normalizes next states.
         compile_: compiles what needs no random numbers; None leaves it as it is.
     """
-    random = network.encoder.is_random
+    random, double_q, by_batch = network.encoder.is_random, config.double_q, config.next_statistics == "batch"
 
     def values(x: Tensor, x_next: Tensor, x_choice: Tensor, context: Context, target_context: Context) -> Values:
         if not random:  # raw observations; random numbers are drawn outside of compiled code
             x, x_next = network.encode(x), network.encode(x_next)
             x_choice = x_next
         with torch.no_grad():
-            next_values = target.values(x_next, target_context, precision=precision, training=False)
+            next_context = _copied(context) if by_batch else context
+            target_context = _copied(target_context) if by_batch else target_context
+            next_values = target.values(x_next, target_context, precision=precision, training=by_batch)
             if double_q:
-                choice_BA = network.decide(x_choice, context, precision=precision, training=False)
+                choice_BA = network.decide(x_choice, next_context, precision=precision, training=by_batch)
             else:
                 choice_BA = target.expected(next_values)
         return Values(differentiated(x, context), next_values, choice_BA)
@@ -77,3 +80,8 @@ def forward_passes(
         return run(network.encode(observations, generator), x_next, x_choice, context, target_context)
 
     return passes
+
+
+def _copied(context: Context) -> Context:
+    """Running statistics that may be moved without a trace."""
+    return {name: tuple(tensor.clone() for tensor in tensors) for name, tensors in context.items()}

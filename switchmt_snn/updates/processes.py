@@ -143,7 +143,7 @@ class Divided(Engine):
             if isinstance(module, TaskBatchNorm):
                 module.normalize = _normalize_over(group, module)  # type: ignore[method-assign]
         differentiated = DistributedDataParallel(DifferentiatedPass(network, self.precision), broadcast_buffers=False)
-        self._passes = forward_passes(network, target, differentiated, self.precision, config.double_q)
+        self._passes = forward_passes(network, target, differentiated, self.precision, config)
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:
         """See ``Engine.values``; of this process's part of a batch."""

@@ -26,9 +26,9 @@ class Values(NamedTuple):
     online: Tensor
     """Values of the observations by Q, in training mode, with a gradient."""
     target: Tensor
-    """Values of the next observations by Q*, in eval mode."""
+    """Values of the next observations by Q*, normalized as ``learning.next_statistics`` says."""
     choice_BA: Tensor
-    """Q-values of the next observations by Q, in eval mode; by Q* without double Q-learning."""
+    """Q-values of the next observations by Q, normalized likewise; by Q* without double Q-learning."""
 
 
 class DeviceBatch(NamedTuple):
