@@ -21,7 +21,8 @@ targets is another one than the network that learns. The background of Pong is a
 one Adam step moves the mean current of a channel of the first layer by a good part of its standard deviation, and
 BatchNorm's running mean stays behind (`off_conv1` below: 0.21 standard deviations; Breakout's background is black). The
 target then chooses and values actions by chance, and the largest of some random values is too large. The preset
-`strong` has four settings against it (`double_q`, `reestimate_statistics_batches`, `next_statistics`, `acting_network`).
+`strong` has four settings against it: `double_q`, `reestimate_statistics_batches`, `next_statistics` and
+`acting_network`.
 """,
 }
 """What a reader must know of a run."""
