@@ -93,8 +93,10 @@ def plugin_name(plugin: type[Any], key: str) -> PluginName:
     A class of the script that runs gets the script's name: ``own_policy:MyCriterion`` in ``python own_policy.py``.
 
     Raises:
-        ConfigError: the class is local to a function or nested in a class, so no config can name it.
+        ConfigError: it is no class, or local to a function or nested in a class, so no config can name it.
     """
+    if not isinstance(plugin, type):
+        raise ConfigError(f"{key} is {plugin!r}, expected a class; names of classes belong into the config")
     module_name = _script_name() or "__main__" if plugin.__module__ == "__main__" else plugin.__module__
     name = f"{module_name}:{plugin.__qualname__}"
     if not is_plugin(name):

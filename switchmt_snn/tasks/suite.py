@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -103,8 +103,8 @@ class TaskSuite:
     in_unit_range: bool
     action_names: tuple[str, ...]
     valid_actions_KA: npt.NDArray[np.bool_]
-    references: dict[str, Reference]
     make: Callable[[int, int], TaskEnvironment]
+    references: dict[str, Reference] = field(default_factory=dict)
     """``make(task, num_envs)`` builds the environments of a task."""
     first_actions: tuple[int, ...] = ()
     thread_safe: bool = False

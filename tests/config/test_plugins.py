@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from switchmt_snn.cli import main
-from switchmt_snn.config.plugins import load_plugin
+from switchmt_snn.config.plugins import load_plugin, plugin_name
 from switchmt_snn.errors import ConfigError
 
 
@@ -57,3 +57,8 @@ def test_a_class_of_an_importable_module_is_found() -> None:
     assert load_plugin("pathlib:Path", "key") is Path
     with pytest.raises(ConfigError, match="key is 'pathlib:Pth'"):
         load_plugin("pathlib:Pth", "key")
+
+
+def test_a_name_in_place_of_a_class_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"policy is 'stale', expected a class"):
+        plugin_name("stale", "policy")  # type: ignore[arg-type]

@@ -190,7 +190,35 @@ class WrongRest(Good):
         return torch.zeros_like(current_t)
 
 
+class RunsAnother(Good):
+    """Its faster form is another model."""
+
+    def run(self, current: torch.Tensor, state: Any) -> Any:
+        return self.surrogate(current - self.threshold), state
+
+
+class RunsAnotherState(Good):
+    def run(self, current: torch.Tensor, state: Any) -> Any:
+        spikes, last = super().run(current, state)
+        return spikes, (last[0] + 1.0,)
+
+
+class RunsBare(Good):
+    def run(self, current: torch.Tensor, state: Any) -> Any:
+        return super().run(current, state)[0]
+
+
+class NoNumber(Good):
+    def step(self, current_t: torch.Tensor, state: Any) -> Any:
+        spikes, (membrane,) = super().step(current_t, state)
+        return spikes, (membrane.log(),)
+
+
 MISTAKES = {
+    RunsAnother: "gives other spikes in run than in step",
+    RunsAnotherState: "gives another membrane in run than in step",
+    RunsBare: r"returns a float32 tensor of shape .* from run",
+    NoNumber: "gives membrane as NaN in step",
     NoState: "states no STATE",
     NoStep: "defines no step",
     StateText: "has STATE = 'membrane', expected a tuple",

@@ -28,8 +28,9 @@ TIMESTEPS = 8
 def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) -> None:
     """Make a layer of the model, play it for a few steps on small tensors, and compare it with the contract.
 
-    Checked: ``STATE``; the constructor; shape, dtype and values of spikes; number, shape and dtype of state variables;
-    that a step changes neither its arguments nor the layer; that a gradient reaches the currents; that the layer can be
+    Checked: ``STATE``; the constructor; shape, dtype and values of spikes; number, shape and dtype of state variables,
+    and that they are numbers; that a step changes neither its arguments nor the layer; that a gradient reaches the
+    currents; that ``run``, if the class has its own, gives what a loop over ``step`` gives; that the layer can be
     copied. It draws from no random generator of the process, and the layer that a network gets is another one.
 
     Args:
@@ -93,12 +94,30 @@ class _Played:
         self._current = self._leaf * 1.0  # no leaf: autograd lets a step change it, and it is seen
 
     def check(self) -> None:
-        state = self._initial()
+        first = state = self._initial()
         spikes = []
         for step in range(TIMESTEPS):
             spikes_t, state = self._step(self._current[step], state)
             spikes.append(spikes_t)
         self._require_gradient(torch.stack(spikes))
+        if self._model.run is not NeuronLayer.run:
+            self._require_run(first, torch.stack(spikes), state)
+
+    def _require_run(self, first: NeuronState, spikes: Tensor, last: NeuronState) -> None:
+        """``run`` is a faster form of the loop over ``step``, not another model."""
+        expected = "the spikes and the last state of a loop over step: (spikes, state)"
+        try:
+            result = self._layer.run(self._current, first)
+        except Exception as error:
+            _refuse(self._model, f"fails in run ({failure(error)})", expected)
+        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[0], Tensor)):
+            _refuse(self._model, f"returns {_kind(result)} from run", expected)
+        self._require_state("run", result[1], last)
+        if result[0].shape != spikes.shape or not torch.equal(result[0], spikes):
+            _refuse(self._model, "gives other spikes in run than in step", expected)
+        for name, ours, theirs in zip(self._model.STATE, result[1], last, strict=True):
+            if not torch.allclose(ours, theirs, rtol=1e-4, atol=1e-5):
+                _refuse(self._model, f"gives another {name} in run than in step", expected)
 
     def _initial(self) -> NeuronState:
         current_t = self._current[0]
@@ -153,7 +172,7 @@ class _Played:
                 f"gives {_kind(spikes)} as spikes for currents of shape {tuple(current_t.shape)}",
                 f"{_kind(current_t)}",
             )
-        other = spikes[(spikes != 0) & (spikes != 1)]
+        other = spikes[(spikes != 0) & (spikes != 1)]  # NaN, too
         if other.numel():
             _refuse(self._model, f"gives {other[0].item():g} as a spike", "0 or 1, as self.surrogate(u) gives")
 
@@ -172,6 +191,8 @@ class _Played:
             same = variable.shape[:1] == old.shape[:1] if before is None else variable.shape == old.shape
             if not same or variable.dtype != old.dtype:
                 _refuse(self._model, f"returns {name} as {_kind(variable)} from {method}", f"{_kind(old)}")
+            if bool(variable.isnan().any()):
+                _refuse(self._model, f"gives {name} as NaN in {method}", "numbers for currents of -4 to 4 thresholds")
 
     def _require_gradient(self, spikes: Tensor) -> None:
         """A gradient of zero is refused only if some neurons fired and others did not: then some came near."""
