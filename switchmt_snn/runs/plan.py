@@ -26,7 +26,7 @@ from switchmt_snn.machine.devices import has_bfloat16, select_device
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.memory import MemoryEstimate, require_gpu_memory, require_memory
-from switchmt_snn.spiking.encodings import try_encoding
+from switchmt_snn.spiking.encoding_check import try_encoding
 from switchmt_snn.tasks.check import check_before_training
 from switchmt_snn.tasks.registry import make_suite, suite_of
 from switchmt_snn.tasks.suite import TaskSuite

@@ -8,7 +8,9 @@ Shapes: T simulation steps, B batch, k frames per stack, c channels per frame, C
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -133,8 +135,8 @@ def check_encoding(encoding: Any, name: str) -> type[Encoding]:
     """Return the class if it is a whole encoding.
 
     Raises:
-        ConfigError: it is no subclass of ``Encoding``, or lacks ``Encoding.makes_spikes`` or
-            ``Encoding.encode``.
+        ConfigError: it is no subclass of ``Encoding``, lacks ``Encoding.makes_spikes`` or ``Encoding.encode``, or its
+            ``channels`` or ``steps`` is no classmethod.
     """
     seen = f"network.encoding is {name!r}"
     if not (isinstance(encoding, type) and issubclass(encoding, Encoding)):
@@ -147,6 +149,9 @@ def check_encoding(encoding: Any, name: str) -> type[Encoding]:
         value = getattr(encoding, fact, None)
         if not isinstance(value, bool):
             raise ConfigError(f"{seen}, whose {fact} is {value!r}, expected True or False")
+    for method, taken in (("channels", "cls, observation_channels, frame_stack"), ("steps", "cls, frame_stack")):
+        if not isinstance(inspect.getattr_static(encoding, method), classmethod):
+            raise ConfigError(f"{seen}, whose {method} is no classmethod, expected @classmethod, def {method}({taken})")
     return encoding
 
 
@@ -159,7 +164,8 @@ def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) 
         in_unit_range: whether scaled observations have values in [0, 1].
 
     Raises:
-        ConfigError: an unknown encoding, or one that cannot express the observations in T steps.
+        ConfigError: an unknown encoding, one that cannot express the observations in T steps, or one from outside the
+            package whose ``steps`` or constructor fails.
     """
     cls = encoding_class(config.encoding)
     if cls.needs_unit_range and not in_unit_range:
@@ -168,45 +174,46 @@ def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) 
             f"network.encoding is {config.encoding!r}, expected one of {others} for vector observations; "
             f"{config.encoding} needs values in [0, 1]"
         )
-    steps = cls.steps(frame_stack)
+    with encoding_code(config.encoding, "steps", "steps(frame_stack) -> int, or None for any number of steps"):
+        steps: Any = cls.steps(frame_stack)
+    if not (steps is None or (isinstance(steps, int) and steps > 0)):
+        raise ConfigError(
+            f"network.encoding is {config.encoding!r}, whose steps gave {steps!r} for frame_stack {frame_stack}, "
+            "expected a number of simulation steps, or None if any will do"
+        )
     if steps is not None and config.timesteps != steps:
         raise ConfigError(
             f"network.timesteps is {config.timesteps!r}, expected {steps} for encoding {config.encoding} with "
             f"tasks.frame_stack {frame_stack}"
         )
-    return cls(config, frame_stack)
+    form = "__init__(self, config, frame_stack) with super().__init__(config, frame_stack)"
+    with encoding_code(config.encoding, "its constructor", form):
+        encoding = cls(config, frame_stack)
+    if not {"timesteps", "frame_stack"} <= vars(encoding).keys():
+        raise ConfigError(
+            f"network.encoding is {config.encoding!r}, which does not call super().__init__(config, frame_stack), "
+            "expected it as the first line of __init__(self, config, frame_stack)"
+        )
+    return encoding
 
 
-def try_encoding(config: NetworkConfig, shape: tuple[int, ...], frame_stack: int, in_unit_range: bool) -> None:
-    """Encode two made-up observations, so that a mistake in a class from outside shows before training.
-
-    Args:
-        config: names the encoding.
-        shape: of one stacked observation.
-        frame_stack: frames k in it.
-        in_unit_range: whether scaled observations have values in [0, 1].
+@contextmanager
+def encoding_code(name: str, where: str, expected: str) -> Iterator[None]:
+    """Around a call of an encoding: what a class from outside the package raises becomes one line.
 
     Raises:
-        ConfigError: ``encode`` fails, or gives something else than the class states.
+        ConfigError: naming the class and the line of its code.
     """
-    encoding = make_encoding(config, frame_stack, in_unit_range)
-    generator = torch.Generator().manual_seed(0)
-    observations = torch.rand((2, *shape), generator=generator)
     try:
-        with torch.random.fork_rng(devices=[]):
-            inputs = encoding(observations, generator)
+        yield
     except SwitchMTError:
         raise
     except Exception as error:
+        if not is_plugin(name):
+            raise
         raise ConfigError(
-            f"network.encoding is {config.encoding!r}, which fails in encode ({failure(error)}), expected inputs for "
-            f"observations of shape {tuple(observations.shape)}"
+            f"network.encoding is {name!r}, which fails in {where} ({failure(error)}), expected {expected}"
         ) from error
-    if encoding.makes_spikes and not bool(((inputs == 0) | (inputs == 1)).all()):
-        raise ConfigError(
-            f"network.encoding is {config.encoding!r}, which gives values from {inputs.min():g} to {inputs.max():g}, "
-            "expected 0 and 1 only, as its makes_spikes = True says"
-        )
 
 
 @register_encoding("direct")

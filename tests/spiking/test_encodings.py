@@ -11,7 +11,8 @@ from torch import Tensor
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.network import ENCODING_NAMES
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.spiking.encodings import ENCODINGS, Encoding, make_encoding, register_encoding, try_encoding
+from switchmt_snn.spiking.encoding_check import try_encoding
+from switchmt_snn.spiking.encodings import ENCODINGS, Encoding, make_encoding, register_encoding
 
 
 def encoder(encoding: str, timesteps: int, stack: int = 1) -> Encoding:
@@ -196,6 +197,84 @@ class HalfSpikes(Inverted):
         return 0.5 * super().encode(x, generator)
 
 
+class ChangesItsArgument(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x.mul_(2).unsqueeze(0)
+
+
+class Counts(Inverted):
+    calls = 0
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        self.calls += 1
+        return x.unsqueeze(0) + self.calls
+
+
+class RemembersTheLast(Inverted):
+    """Differs only if other observations came in between."""
+
+    last = 0.0
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        before, self.last = self.last or x.mean(), x.mean()
+        return x.unsqueeze(0) - before
+
+
+class DrawsWithoutSayingSo(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return torch.rand(x.shape, generator=generator).unsqueeze(0)
+
+
+class DrawsFromTorch(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return torch.rand(x.shape).unsqueeze(0)
+
+
+class RandomFromTorch(DrawsFromTorch):
+    is_random = True
+
+
+class RandomFromItsGenerator(DrawsWithoutSayingSo):
+    is_random = True
+
+
+class Logarithm(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x.log().unsqueeze(0)
+
+
+class StepsOfAnInstance(Inverted):
+    def steps(self, frame_stack: int) -> int | None:  # type: ignore[override]
+        return frame_stack
+
+
+class ChannelsOfAnInstance(Inverted):
+    def channels(self, observation_channels: int, frame_stack: int) -> int:  # type: ignore[override]
+        return observation_channels
+
+
+class StepsAsText(Inverted):
+    @classmethod
+    def steps(cls, frame_stack: int) -> int | None:
+        return "3"  # type: ignore[return-value]
+
+
+class FailsInChannels(Inverted):
+    @classmethod
+    def channels(cls, observation_channels: int) -> int:  # type: ignore[override]
+        return observation_channels
+
+
+class OwnConstructor(Inverted):
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+
+class ForgetsItsParent(Inverted):
+    def __init__(self, config: NetworkConfig, frame_stack: int) -> None:
+        self.gain = 1.0
+
+
 @pytest.mark.parametrize(
     ("encoding", "complaint"),
     [
@@ -203,6 +282,23 @@ class HalfSpikes(Inverted):
         (GivesNothing, "gave None from encode, expected a tensor of shape"),
         (FailsToEncode, r"fails in encode \(AttributeError: .*'gain' at test_encodings.py, line"),
         (HalfSpikes, "expected 0 and 1 only, as its makes_spikes = True says"),
+        (ChangesItsArgument, "changes its argument x in place in encode, expected a new tensor"),
+        (Counts, "gives other inputs when it encodes the same .* again, expected .* no state"),
+        (
+            RemembersTheLast,
+            "gives other inputs when it encodes the same .* again, expected .* no state",
+        ),
+        (DrawsWithoutSayingSo, "draws random numbers, expected is_random = True"),
+        (DrawsFromTorch, "draws random numbers, expected is_random = True"),
+        (RandomFromTorch, r"draws random numbers that are not its generator's, expected .*generator=generator"),
+        (RandomFromItsGenerator, None),
+        (Logarithm, "gives -inf for observations from 0 to 1, expected finite numbers"),
+        (StepsOfAnInstance, r"whose steps is no classmethod, expected @classmethod, def steps\(cls, frame_stack\)"),
+        (ChannelsOfAnInstance, "whose channels is no classmethod, expected @classmethod, def channels"),
+        (StepsAsText, "whose steps gave '3' for frame_stack 2, expected a number of simulation steps, or None"),
+        (FailsInChannels, r"fails in channels \(TypeError: .*, expected channels\(observation_channels, frame_stack\)"),
+        (OwnConstructor, r"fails in its constructor \(TypeError: .*, expected __init__\(self, config, frame_stack\)"),
+        (ForgetsItsParent, r"does not call super\(\).__init__\(config, frame_stack\), expected it as the first line"),
     ],
 )
 def test_an_encoding_from_outside_is_tried_before_training(encoding: type, complaint: str | None) -> None:

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import copy
 import math
-import random
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NoReturn
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.plugins import failure
 from switchmt_snn.errors import ConfigError, SwitchMTError
+from switchmt_snn.spiking.apart import apart
 from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState
 
 TIMESTEPS = 8
@@ -42,7 +39,7 @@ def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) 
     """
     config = NetworkConfig() if config is None else config
     _check_class(model)
-    with _apart():
+    with apart():
         layer = _made(model, config)
         shapes: list[tuple[int, ...]] = [(4, config.hidden_units or 64)]
         if config.trunk != "mlp":
@@ -210,19 +207,6 @@ def _contents(layer: NeuronLayer) -> dict[str, tuple[Any, int]]:
     tensors = {**dict(layer.named_parameters()), **dict(layer.named_buffers())}
     named = {**vars(layer), **tensors}
     return {name: (value, value._version if isinstance(value, Tensor) else 0) for name, value in named.items()}
-
-
-@contextmanager
-def _apart() -> Iterator[None]:
-    """On the CPU, with gradients, and with random numbers of its own: the process's generators stay where they are."""
-    python, numpy = random.getstate(), np.random.get_state()
-    try:
-        with torch.random.fork_rng(devices=[]), torch.device("cpu"), torch.enable_grad():
-            torch.default_generator.manual_seed(0)
-            yield
-    finally:
-        random.setstate(python)
-        np.random.set_state(numpy)
 
 
 def _kind(value: Any) -> str:
