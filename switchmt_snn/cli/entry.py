@@ -14,7 +14,7 @@ from switchmt_snn.viewing.output import speak_any_encoding
 USAGE = """\
 usage: switchmt-snn COMMAND [options]
 
-  train [CONFIG]      train, or continue a run (CONFIG: a YAML file or a preset; default: quickstart)
+  train [CONFIG]      train (CONFIG: a YAML file or a preset; default: quickstart), or continue the run of --run DIR
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)

@@ -14,7 +14,7 @@ from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
 
 ARGUMENTS = {
-    "train": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
+    "train": ("CONFIG", "a YAML file or a preset (default: with --run the config of the run there, else quickstart)"),
     "describe": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
     "evaluate": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),

@@ -23,7 +23,7 @@ class TrainOptions:
 
     experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
     run: Path | None = None
-    """Run folder: continued if it holds a run of the same config, otherwise made. Default: a new one in runs/."""
+    """Run folder: continued if it holds a run of the same config, else made of CONFIG. Default: a new one in runs/."""
     print_config: bool = False
     """Print the resolved config as YAML and stop."""
     json: bool = False
@@ -36,6 +36,10 @@ def command(argv: list[str]) -> int:
     run = peek(rest, "--run")
     default = _starting_config(source, run)
     options = parse(TrainOptions, rest, "train", TrainOptions(experiment=default))
+    if source is None and options.run is not None:
+        from switchmt_snn.runs.folder import RunFolder
+
+        RunFolder(options.run).require()  # a wrong name must not begin a run of quickstart there
     config = resolve(options.experiment)
     if options.print_config:
         print(to_yaml(config, options.experiment), end="")
@@ -102,7 +106,7 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path, step:
 
 
 def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:
-    """The config that flags change: the file that is named, else the run's own, else quickstart."""
+    """The config that flags change: the file that is named, else the run's own, else quickstart's."""
     if source is None and run is not None:
         from switchmt_snn.runs.folder import RunFolder
 

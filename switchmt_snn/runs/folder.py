@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import shlex
 import time
 from dataclasses import replace
 from datetime import datetime
@@ -18,12 +19,13 @@ import filelock
 
 from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
-from switchmt_snn.errors import ConfigError, RunFolderError
+from switchmt_snn.errors import ConfigError, RunFolderError, nearest
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
 from switchmt_snn.runs.files import json_text, write_atomically
 
 RUNS = Path("runs")
+LOCK = {"run.lock"}
 
 
 def claim_new_run(name: str) -> RunFolder:
@@ -88,14 +90,24 @@ class RunFolder:
             return False
         return isinstance(facts, dict) and facts.get("program") == "switchmt-snn"
 
+    @property
+    def _is_free(self) -> bool:
+        """Whether nothing is here; an empty folder and a lock are nothing."""
+        return not self.path.exists() or (self.path.is_dir() and {entry.name for entry in self.path.iterdir()} <= LOCK)
+
     def require(self) -> RunFolder:
         """This folder, if it is a run.
 
         Raises:
-            RunFolderError: it does not exist, or holds something else.
+            RunFolderError: it does not exist, is empty, or holds something else.
         """
-        if not self.path.exists():
-            raise RunFolderError(f"no run folder {self.path}, expected one; run switchmt-snn train --run {self.path}")
+        if self._is_free:
+            begin = f"switchmt-snn train quickstart --run {shlex.quote(str(self.path))}"
+            beside = [path.parent.name for path in self.path.parent.glob("*/environment.json")]
+            raise RunFolderError(
+                f"no run folder {self.path}, expected one; a new run needs a config: {begin}"
+                f"{nearest(self.path.name, beside)}"
+            )
         if not self.is_run:
             raise RunFolderError(
                 f"{self.path} is not a run of switchmt-snn (no environment.json of ours), expected a run folder; "
@@ -149,10 +161,10 @@ class RunFolder:
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            strangers = [entry.name for entry in self.path.iterdir() if entry.name not in ("run.lock",)]
-            if strangers:
+            if not self._is_free:
+                stranger = min(entry.name for entry in self.path.iterdir() if entry.name not in LOCK)
                 raise RunFolderError(
-                    f"{self.path} holds {sorted(strangers)[0]!r} but no run, expected an empty or new folder; "
+                    f"{self.path} holds {stranger!r} but no run, expected an empty or new folder; "
                     "name another one with --run"
                 )
             (self.path / "checkpoints").mkdir()

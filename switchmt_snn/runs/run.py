@@ -77,8 +77,8 @@ def train(
     """Train, or continue a run.
 
     Args:
-        config: a config, a YAML file, or a preset's name. None continues ``run`` with its stored config, or takes the
-            quickstart preset for a new run.
+        config: a config, a YAML file, or a preset's name. None continues ``run``, which must hold a run, with its
+            stored config; without ``run``, too, it takes the quickstart preset.
         run: run folder. One that holds a run of the same config is continued; None makes a new one under ``runs/``.
         observers: progress displays and the like.
         policy: a switching criterion of your own in place of the config's. The run stores its name, so that it can be
@@ -117,12 +117,9 @@ def _train(
     policy: type[Criterion] | None,
     suite: type[Suite] | None,
 ) -> RunResult:
-    if isinstance(config, (str, Path)):
-        config = load_config(config)
     folder = RunFolder(Path(run)) if run is not None else None
     stored = folder.config() if folder is not None and folder.is_run else None
-    if config is None:
-        config = stored or load_config("quickstart")
+    config = _asked(config, folder, stored)
     if policy is not None:
         config = replace(config, switching=replace(config.switching, policy=plugin_name(policy, "policy")))
     if suite is not None:
@@ -155,6 +152,17 @@ def _train(
             training.close()
     finally:
         lock.release()
+
+
+def _asked(
+    config: ExperimentConfig | str | Path | None, folder: RunFolder | None, stored: ExperimentConfig | None
+) -> ExperimentConfig:
+    """The config that a call asks for; None continues the run of a folder that is named."""
+    if isinstance(config, (str, Path)):
+        return load_config(config)
+    if config is None and folder is not None:
+        folder.require()
+    return config or stored or load_config("quickstart")
 
 
 def _serve(group: ProcessGroup) -> RunResult:

@@ -115,7 +115,7 @@ def test_describe_table_names_every_method(capsys) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_trains_on_atari(method: str, tmp_path: Path, capsys) -> None:
     run = tmp_path / "run"
-    code, out, err = call(capsys, "train", "--run", str(run), "--network.method", method, *SMALL)
+    code, out, err = call(capsys, "train", "quickstart", "--run", str(run), "--network.method", method, *SMALL)
     assert code == 0, err
     assert "Scores at step 240" in out
     assert "SwitchMT (paper)" in out
@@ -145,7 +145,7 @@ def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path
     ]
     flags += ["--switching.plateau-window-episodes", "3", "--switching.visit-episodes", "2"]
     flags += ["--switching.visit-steps", "50", "--switching.max-stay-steps", "200"]
-    code, _, err = call(capsys, "train", "--run", str(run), *flags)
+    code, _, err = call(capsys, "train", "quickstart", "--run", str(run), *flags)
     assert code == 0, err
     rows = list(csv.DictReader((run / "switches.csv").read_text().splitlines()))
     assert rows
@@ -197,6 +197,13 @@ def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypat
         (["train", "--learning.replay-capacity-steps", "999999999"], "lower learning.replay_capacity_steps to at most"),
         (["train", "--network.method", "best"], "invalid choice 'best'"),
         (["evaluate"], "expected one; run switchmt-snn train"),
+        (
+            ["train", "--run", "runs/typo", "--total-steps", "100"],
+            "no run folder runs/typo, expected one; a new run needs a config: "
+            "switchmt-snn train quickstart --run runs/typo",
+        ),
+        (["train", "--run=runs/typo", "--print-config"], "no run folder runs/typo"),
+        (["export", "runs/my typo"], "switchmt-snn train quickstart --run 'runs/my typo'"),
         (["describe", "--network.trunk", "minatar", "--tasks.names", "nope"], "unknown atari task"),
     ],
 )
@@ -282,7 +289,7 @@ def test_best_weights_are_kept_and_can_be_evaluated(tmp_path: Path, capsys) -> N
     run = tmp_path / "run"
     flags = [word if word != "240" else "900" for word in SMALL]
     flags += ["--tasks.suite", "gym", "--tasks.names", "CartPole-v1"]
-    assert call(capsys, "train", "--run", str(run), *flags)[0] == 0
+    assert call(capsys, "train", "quickstart", "--run", str(run), *flags)[0] == 0
     manifest = json.loads((run / "checkpoints" / "best" / "manifest.json").read_text())
     code, out, _ = call(capsys, "evaluate", str(run), "--checkpoint", "best", "--episodes", "2", "--json")
     assert code == 0
@@ -294,7 +301,7 @@ def test_tensorboard_is_one_more_view(tmp_path: Path, capsys) -> None:
 
     run = tmp_path / "run"
     flags = ["--tasks.suite", "gym", "--tasks.names", "CartPole-v1", "--recording.tensorboard"]
-    code, _, err = call(capsys, "train", "--run", str(run), *SMALL, *flags)
+    code, _, err = call(capsys, "train", "quickstart", "--run", str(run), *SMALL, *flags)
     assert code == 0, err
     events = EventAccumulator(str(run / "tensorboard")).Reload()
     returns = [(point.step, point.value) for point in events.Scalars("return/CartPole-v1")]

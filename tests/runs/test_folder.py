@@ -11,6 +11,7 @@ import pytest
 
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.folder import RunFolder, claim_new_run, latest_run
+from switchmt_snn.runs.run import train
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +33,18 @@ def test_trainings_that_begin_together_get_folders_of_their_own() -> None:
     paths = {folder.path for folder in folders}
     assert len(paths) == 24
     assert all(path.is_dir() and "_same" in path.name for path in paths)
+
+
+def test_a_folder_without_a_run_is_refused_with_the_nearest_one_and_the_command_for_a_new_one() -> None:
+    begun("cartpole", "2026-01-01T00:00:00+0000", 0)
+    Path("runs/cartpol").mkdir()
+    Path("runs/cartpol/run.lock").touch()
+    command = "switchmt-snn train quickstart --run runs/cartpol; did you mean 'cartpole'?"
+    for use in (lambda: train(run="runs/cartpol"), RunFolder(Path("runs/cartpol")).require):
+        with pytest.raises(RunFolderError, match="no run folder runs/cartpol, expected one") as refused:
+            use()
+        assert str(refused.value).endswith(command)
+    assert [path.name for path in Path("runs/cartpol").iterdir()] == ["run.lock"]
 
 
 def test_a_folder_that_became_a_run_in_the_meantime_is_refused() -> None:
