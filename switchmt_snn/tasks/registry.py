@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-import numpy as np
-
-from switchmt_snn.config import SuiteDefaults, TasksConfig, resolved_frame_stack
+from switchmt_snn.config import SuiteDefaults, TasksConfig
 from switchmt_snn.config.plugins import is_plugin, load_plugin, plugin_name
 from switchmt_snn.config.suites import register_defaults, require_suite_name
 from switchmt_snn.errors import ConfigError, TaskError, did_you_mean
 from switchmt_snn.tasks.atari import AtariSuite
+from switchmt_snn.tasks.facts import is_outside, require_facts, require_tasks, suite_code
 from switchmt_snn.tasks.gym import GymSuite
 from switchmt_snn.tasks.minatar import MinAtarSuite
 from switchmt_snn.tasks.suite import Suite, TaskSuite
@@ -56,8 +55,14 @@ def find_suite(name: str) -> type[Suite]:
 
 
 def suite_of(config: TasksConfig) -> Suite:
-    """The suite of a config: its facts under these settings."""
-    return find_suite(config.suite)(config)
+    """The suite of a config: its facts under these settings.
+
+    Raises:
+        TaskError: the constructor of a suite from outside the package fails.
+    """
+    suite = find_suite(config.suite)
+    with suite_code(suite, config.suite, "its constructor"):
+        return suite(config)
 
 
 def make_suite(config: TasksConfig) -> TaskSuite:
@@ -69,7 +74,10 @@ def make_suite(config: TasksConfig) -> TaskSuite:
         MissingExtraError: the suite needs an optional package.
     """
     suite = suite_of(config)
-    known = suite.known_tasks()
+    with suite_code(type(suite), config.suite, "known_tasks"):
+        known = suite.known_tasks()
+    if is_outside(type(suite)):
+        require_facts(suite, config)
     for name in config.names:
         if name not in known and not suite.open_names:
             raise TaskError(f"tasks.names has the unknown {suite.name} task {name!r}{did_you_mean(name, known)}")
@@ -84,30 +92,9 @@ def make_suite(config: TasksConfig) -> TaskSuite:
                 f"tasks.{key} is {getattr(config, key)!r}, expected the default for the suite {config.suite!r}, whose "
                 "environments are no Gymnasium environments (takes_wrappers)"
             )
-    tasks = suite.make()
-    stack, shape = resolved_frame_stack(config), tasks.valid_actions_KA.shape
-    readable = all(name and name.isprintable() and not set(name) & set(',"') for name in tasks.names)
-    checks = (
-        (readable, f"names {tasks.names}", "printable names without commas and quotes, which tables could not hold"),
-        (tasks.names == config.names, f"names {tasks.names}", f"those of the config, {config.names}"),
-        (tasks.frame_stack == stack, f"frame_stack {tasks.frame_stack}", f"{stack}"),
-        (len(tasks.frame_shape) in (1, 3), f"frame_shape {tasks.frame_shape}", "(features,) or (channels, H, W)"),
-        (np.dtype(tasks.frame_dtype) in (np.uint8, np.float32), f"frame_dtype {tasks.frame_dtype}", "uint8 or float32"),
-        (
-            shape == (len(tasks.names), tasks.num_actions) and bool(tasks.valid_actions_KA.any(axis=1).all()),
-            f"valid_actions_KA {tasks.valid_actions_KA.tolist()}",
-            "a row per task and a column per action, at least one action true in each row",
-        ),
-        (
-            len(tasks.first_actions) in (0, len(tasks.names)),
-            f"first_actions {tasks.first_actions}",
-            f"none, or one for each of {len(tasks.names)} tasks",
-        ),
-    )
-    for holds, seen, expected in checks:
-        if not holds:
-            raise TaskError(f"the suite {config.suite!r} makes tasks of {seen}, expected {expected}; change its make()")
-    return tasks
+    with suite_code(type(suite), config.suite, "make"):
+        tasks = suite.make()
+    return require_tasks(tasks, config)
 
 
 def _require_complete(suite: object) -> None:

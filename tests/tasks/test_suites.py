@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,7 +21,7 @@ from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.check import check_before_training, check_suite
 from switchmt_snn.tasks.registry import SUITES, find_suite, make_suite, register_suite, suite_of
-from switchmt_snn.tasks.suite import Suite, TaskSuite
+from switchmt_snn.tasks.suite import Reference, Suite, TaskSuite
 from tests.conftest import CountingEnvironment, vector_suite
 
 NAMES = tuple(SUITES)
@@ -179,12 +180,75 @@ def test_a_suite_that_makes_other_tasks_than_asked_is_named(counting: type[Suite
         (replace(good, frame_stack=3), "frame_stack 3, expected 2"),
         (replace(good, frame_shape=(2, 2)), "frame_shape"),
         (replace(good, frame_dtype=np.float64), "uint8 or float32"),
-        (replace(good, valid_actions_KA=np.zeros((2, 2), np.bool_)), "at least one action"),
+        (replace(good, valid_actions_KA=np.zeros((2, 2), np.bool_)), "one or more true in a row"),
+        (
+            replace(good, valid_actions_KA=[[True, True]] * 2),
+            r"valid_actions_KA \[\[True, .*expected an array",
+        ),
+        (replace(good, valid_actions_KA=np.ones((2, 2), np.int64)), "expected an array of truth values"),
+        (replace(good, references={"a": 3.0}), r"references {'a': 3.0}, expected Reference\(random, human, source\)"),
+        (replace(good, references={"a": Reference(1.0, 1.0, "x")}), "expected Reference.* two numbers that differ"),
+        (replace(good, scale=0.0), "scale 0.0, expected a number above 0"),
+        (replace(good, scale="1"), "scale '1', expected a number above 0"),
+        (replace(good, in_unit_range="no"), "in_unit_range 'no', expected True or False"),
+        (replace(good, frame_dtype="picture"), "frame_dtype 'picture', expected uint8 or float32"),
+        (replace(good, frame_shape=4), r"frame_shape 4, expected \(features,\)"),
+        (replace(good, action_names="ab"), "action_names 'ab', expected a tuple of texts"),
+        (replace(good, first_actions=(0.5, 1)), "expected none, or one whole number for each of 2 tasks"),
+        (replace(good, names=(1, 2)), "names .1, 2., expected printable names"),
+        (None, "gave None from make, expected a TaskSuite"),
     )
     for tasks, message in wrong:
         monkeypatch.setattr(Counting, "make", lambda self, tasks=tasks: tasks)
         with pytest.raises(TaskError, match=message):
             make_suite(TasksConfig(suite="counting", names=("a", "b")))
+
+
+def raises(error: Exception) -> Any:
+    def code(*_: object) -> None:
+        raise error
+
+    return code
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no robot"), KeyError("a")])
+@pytest.mark.parametrize(
+    ("attribute", "where"), [("make", "make"), ("known_tasks", "known_tasks"), ("__init__", "its constructor")]
+)
+def test_what_a_suite_raises_is_one_line(
+    counting: type[Suite], monkeypatch: pytest.MonkeyPatch, error: Exception, attribute: str, where: str
+) -> None:
+    monkeypatch.setattr(Counting, attribute, raises(error))
+    with pytest.raises(
+        TaskError, match=rf"fails in {where} \({type(error).__name__}: .* at test_suites.py, line"
+    ) as caught:
+        make_suite(TasksConfig(suite="counting", names=("a", "b")))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("fact", "value", "expected"),
+    [
+        ("protocol", "no sticky actions", "a tuple of texts"),
+        ("protocol", property(raises(KeyError("x"))), r"fails in protocol \(KeyError: 'x' at test_suites.py, line"),
+        ("references", {"a": 3.0}, r"Reference\(random, human, source\)"),
+        ("published", ("nobody",), "a tuple of PublishedScores"),
+        ("frames_per_s", "60", "a number above 0, or None"),
+        ("frame_skip", 0, "a whole number above 0"),
+        ("steps_to_learn", 1e6, "a whole number above 0, or None"),
+        ("tasks_with_lives", ("c",), "a tuple of names in"),
+        ("packages", "numpy", "a tuple of names"),
+        ("masks_actions", "no", "True or False"),
+        ("files", {"weights": "weights.bin"}, "a pathlib.Path of a file that exists"),
+    ],
+)
+def test_a_fact_of_a_suite_that_nothing_can_show_or_store_is_named(
+    counting: type[Suite], monkeypatch: pytest.MonkeyPatch, fact: str, value: object, expected: str
+) -> None:
+    monkeypatch.setattr(Counting, fact, value)
+    with pytest.raises(TaskError, match=rf"(states {fact} = .*, expected )?{expected}") as caught:
+        make_suite(TasksConfig(suite="counting", names=("a", "b")))
+    assert f" {fact} " in str(caught.value)
 
 
 class Forgetful(CountingEnvironment):
