@@ -359,6 +359,29 @@ class WordMeasured(ReturnAbove):
         return Verdict(False, "never", {"mean_return": "high"})  # type: ignore[dict-item]
 
 
+class NaNMeasured(ReturnAbove):
+    def end_of_episode(self, record: EpisodeRecord) -> Verdict:
+        return Verdict(False, "never", {"mean_return": float("nan")})
+
+
+class NoComma(ReturnAbove):
+    SAVED = "returns"  # type: ignore[assignment]
+
+
+class DerivedAsText(ReturnAbove):
+    DERIVED = "bound"  # type: ignore[assignment]
+
+
+class JudgesInWords(ReturnAbove):
+    judges_learning = "no"  # type: ignore[assignment]
+
+
+class TextSnapshots(ReturnAbove):
+    @classmethod
+    def snapshots(cls, config: SwitchingConfig) -> int:
+        return "one"  # type: ignore[return-value]
+
+
 class Fails(ReturnAbove):
     def end_of_episode(self, record: EpisodeRecord) -> Verdict:
         return Verdict(record.reward > 1, "never", {})  # type: ignore[attr-defined]
@@ -393,6 +416,11 @@ class WithoutConfig(ReturnAbove):
         (Nothing, "Nothing returned None from end_of_episode"),
         (NoReason, "expected leave True or False, reason a text"),
         (WordMeasured, "WordMeasured measured 'mean_return' as 'high', expected a number"),
+        (NaNMeasured, "NaNMeasured measured 'mean_return' as nan, expected a number; leave it out of measured"),
+        (NoComma, r"whose SAVED is 'returns', expected a tuple of names, as \(\"returns\",\) with its comma"),
+        (DerivedAsText, r"whose DERIVED is 'bound', expected a tuple of names"),
+        (JudgesInWords, "whose judges_learning is 'no', expected True or False"),
+        (TextSnapshots, "whose snapshots gave 'one', expected a whole number from 0"),
         (Fails, r"fails in end_of_episode \(AttributeError: 'EpisodeRecord' .* at test_switching.py, line"),
         (FailsInSecondVisit, r"fails in end_of_episode \(AttributeError: 'NoneType'"),
         (SavesSet, "SavesSet.returns is a set, expected what a checkpoint can hold"),

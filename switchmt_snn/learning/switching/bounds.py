@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
+from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.state import Stateful, require_storable
 from switchmt_snn.learning.switching.criterion import (
@@ -156,14 +158,17 @@ class SwitchingPolicy(Stateful):
         return {name: self._number(name, value) for name, value in verdict.measured.items()}
 
     def _number(self, column: str, value: Any) -> float:
+        """A measured value as a float; the criteria of this package may measure NaN, of a network that diverged."""
         try:
-            if not isinstance(value, str):
-                return float(value)
+            number = math.nan if isinstance(value, str) else float(value)
         except (TypeError, ValueError, RuntimeError):
-            pass
-        raise ConfigError(
-            f"criterion {type(self.criterion).__name__} measured {column!r} as {value!r}, expected a number"
-        )
+            number = math.nan
+        if math.isnan(number) and (is_plugin(self.config.policy) or not isinstance(value, float)):
+            raise ConfigError(
+                f"criterion {type(self.criterion).__name__} measured {column!r} as {value!r}, expected a number; leave "
+                "it out of measured while it has none"
+            )
+        return number
 
     def _undeclared_snapshot(self) -> Tensor:
         name = type(self.criterion).__name__

@@ -152,8 +152,8 @@ def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
     """Return the class if it is a whole criterion.
 
     Raises:
-        ConfigError: it is no subclass of ``Criterion``, or lacks ``Criterion.columns`` or
-            ``Criterion.end_of_episode``, or a column bears a name of ``DECISION_COLUMNS``.
+        ConfigError: it is no subclass of ``Criterion``, lacks ``Criterion.columns`` or ``Criterion.end_of_episode``, a
+            column bears a name of ``DECISION_COLUMNS``, or another fact has another type.
     """
     seen = f"switching.policy is {policy!r}"
     if not (isinstance(criterion, type) and issubclass(criterion, Criterion)):
@@ -168,6 +168,14 @@ def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
             f"{seen}, whose columns are {columns!r}, expected a tuple with the names of the numbers that it measures; "
             "() if it measures none"
         )
+    for attribute in ("SAVED", "DERIVED"):
+        names = getattr(criterion, attribute)
+        if not (isinstance(names, tuple) and all(isinstance(name, str) for name in names)):
+            raise ConfigError(
+                f'{seen}, whose {attribute} is {names!r}, expected a tuple of names, as ("returns",) with its comma'
+            )
+    if not isinstance(criterion.judges_learning, bool):
+        raise ConfigError(f"{seen}, whose judges_learning is {criterion.judges_learning!r}, expected True or False")
     for column in columns:
         if column in DECISION_COLUMNS or not column.isidentifier() or columns.count(column) > 1:
             raise ConfigError(
@@ -205,6 +213,12 @@ def make_criterion(config: SwitchingConfig) -> Criterion:
     with criterion_code(config.policy, "its constructor"):
         criterion = cls(config, **options)
     check_state(criterion)
+    with criterion_code(config.policy, "snapshots"):
+        held: Any = criterion.snapshots(config)
+    if not isinstance(held, int) or held < 0:
+        raise ConfigError(
+            f"switching.policy is {config.policy!r}, whose snapshots gave {held!r}, expected a whole number from 0"
+        )
     return criterion
 
 
