@@ -110,16 +110,16 @@ class Progress:
             f"({training.steps_by_task[index]:,})"
             for index, name in enumerate(training.suite.names)
         )
+        for name, line in self._health().items():
+            if name not in self._said:
+                self.console.print(f"  {line}", highlight=False, soft_wrap=True)
+                self._said.add(name)
         self.console.print(
             f"step {training.steps:,}/{training.config.total_steps:,} {rate:.0f}/s left {left} "
             f"epsilon {self._epsilon:.3f} return (steps): {tasks}{self._learning()}",
             highlight=False,
             soft_wrap=True,
         )
-        for name, line in self._health().items():
-            if name not in self._said:
-                self.console.print(f"  {line}", highlight=False, soft_wrap=True)
-                self._said.add(name)
 
     def _learning(self) -> str:
         return "" if self._loss is None else f" loss {self._loss:.4g} Q {self._q or 0.0:.3f}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.docs.blocks import Block, Reader, blocks, shortened
 
@@ -29,6 +30,16 @@ def test_every_block_of_a_page_runs(page: str, tmp_path: Path) -> None:
     for block in blocks(page):
         if not is_run_elsewhere(block) and block.not_tested is None:
             reader.follow(block)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_configs_of_a_page_explore_less_before_they_end(page: str) -> None:
+    """A reader copies them: with the default's million steps a short run would play at random."""
+    configs = [block for block in blocks(page) if block.language == "yaml" and "total_steps:" in block.text]
+    assert configs or page == "README.md"
+    for block in configs:
+        config = yaml.safe_load(block.text)
+        assert config["learning"].get("epsilon_decay_steps", 1e6) < config["total_steps"], str(block)
 
 
 @pytest.mark.parametrize("page", PAGES)

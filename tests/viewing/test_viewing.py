@@ -15,7 +15,7 @@ from torch import Tensor
 from switchmt_snn.config import NetworkConfig, from_dict, resolve
 from switchmt_snn.config.yaml_io import load_config
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.learning.events import LayerHealth, Measured
+from switchmt_snn.learning.events import LayerHealth, Measured, Stepped
 from switchmt_snn.learning.training import Training
 from switchmt_snn.machine.memory import GIB
 from switchmt_snn.runs.folder import RunFolder
@@ -95,6 +95,17 @@ def test_a_plain_log_says_a_warning_once_while_its_numbers_change(tmp_path: Path
         progress.stop()  # prints a line
     assert stream.getvalue().count("never fire") == 1
     assert "96%" in stream.getvalue()
+
+
+def test_a_plain_log_says_that_a_replay_fills_before_its_first_step(tmp_path: Path) -> None:
+    suite = vector_suite(SameObservationEnvironment, 3)  # type: ignore[arg-type]
+    progress = Progress(Console(file=(stream := io.StringIO()), width=200))
+    progress.start(Training(small_config(), suite, torch.device("cpu")), RunFolder(tmp_path), None)
+    progress(Stepped(step=1, task=0, epsilon=1.0, warming_up=True))
+    greeting, filling, step = stream.getvalue().splitlines()
+    assert greeting.startswith("run ")
+    assert filling.startswith(f"  filling the replay of {suite.names[0]}: random actions until ")
+    assert step.startswith("step ")
 
 
 GYM = {"suite": "gym", "names": ["CartPole-v1"]}
