@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from switchmt_snn.config import NetworkConfig
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.spiking.layers import NeuronNode
 from switchmt_snn.spiking.neurons import NEURONS, SURROGATES, NeuronLayer, check_neuron, make_neuron_layer
 
 THIS = "tests.spiking.test_own_neurons"
@@ -214,6 +216,64 @@ class NoNumber(Good):
         return spikes, (membrane.log(),)
 
 
+@dataclass(frozen=True)
+class GoodNode(NeuronNode):
+    threshold_O: Any
+    kind = "good"
+    states = Good.STATE
+
+
+class Described(Good):
+    def node(self, channels: int) -> Any:
+        return GoodNode(np.full(channels, self.threshold))
+
+
+class FailsInNode(Good):
+    def node(self, channels: int) -> Any:
+        return GoodNode(np.full(channels, self.treshold))
+
+
+class NoNode(Good):
+    def node(self, channels: int) -> Any:
+        return None
+
+
+class ShortNode(Good):
+    def node(self, channels: int) -> Any:
+        return GoodNode(np.full(2, self.threshold))
+
+
+class NumberNode(Good):
+    def node(self, channels: int) -> Any:
+        return GoodNode(self.threshold)
+
+
+class NaNNode(Good):
+    def node(self, channels: int) -> Any:
+        return GoodNode(np.full(channels, np.nan))
+
+
+@dataclass(frozen=True)
+class NamelessNode(NeuronNode):
+    states = Good.STATE
+
+
+class NamelessDescription(Good):
+    def node(self, channels: int) -> Any:
+        return NamelessNode()
+
+
+@dataclass(frozen=True)
+class CommalessNode(NeuronNode):
+    kind = "good"
+    states = "membrane"  # type: ignore[assignment]
+
+
+class CommalessDescription(Good):
+    def node(self, channels: int) -> Any:
+        return CommalessNode()
+
+
 MISTAKES = {
     RunsAnother: "gives other spikes in run than in step",
     RunsAnotherState: "gives another membrane in run than in step",
@@ -242,6 +302,13 @@ MISTAKES = {
     NarrowState: r"returns membrane as a float32 tensor of shape \(4, 1\)",
     NoSurrogate: "without a gradient to the currents",
     GradientOfShareOnly: "whose gradient to all currents is 0",
+    FailsInNode: r"fails in node \(AttributeError: .*'treshold'",
+    NoNode: r"returns None from node\(5\), expected a dataclass derived from NeuronNode",
+    ShortNode: r"has an array of shape \(2,\) as threshold_O from node\(5\), expected an array of 5 numbers",
+    NumberNode: r"has a float as threshold_O from node\(5\), expected an array of 5 numbers",
+    NaNNode: r"has threshold_O = \[nan, .*expected finite numbers",
+    NamelessDescription: r"fails in node \(NotImplementedError: NamelessNode has no kind",
+    CommalessDescription: "has a node whose states are 'membrane', expected a tuple of names",
     WrongRest: "from initial_state, expected a tuple of tensors",
 }
 
@@ -255,7 +322,7 @@ def test_a_mistake_in_a_neuron_is_named_before_a_layer_is_made(model: type[Neuro
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("model", [Good, Stateless, ThreeValues, *dict.fromkeys(NEURONS.values())])
+@pytest.mark.parametrize("model", [Good, Stateless, ThreeValues, Described, *dict.fromkeys(NEURONS.values())])
 @pytest.mark.parametrize("trunk", ["mlp", "nature"])
 def test_a_neuron_that_keeps_the_contract_is_taken(model: type[NeuronLayer], trunk: Any) -> None:
     check_neuron(model, NetworkConfig(trunk=trunk, hidden_units=8))

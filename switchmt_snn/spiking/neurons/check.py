@@ -6,9 +6,11 @@ Shapes: T simulation steps, B batch, ... any feature shape.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from typing import Any, NoReturn
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,10 +18,14 @@ from switchmt_snn.config import NetworkConfig
 from switchmt_snn.config.plugins import failure
 from switchmt_snn.errors import ConfigError, SwitchMTError
 from switchmt_snn.spiking.apart import apart
+from switchmt_snn.spiking.layers import NeuronNode
 from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState
 
 TIMESTEPS = 8
 """Steps for which a model is played."""
+
+CHANNELS = 5
+"""Output channels of the layer that a model describes."""
 
 
 def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) -> None:
@@ -27,8 +33,9 @@ def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) 
 
     Checked: ``STATE``; the constructor; shape, dtype and values of spikes; number, shape and dtype of state variables,
     and that they are numbers; that a step changes neither its arguments nor the layer; that a gradient reaches the
-    currents; that ``run``, if the class has its own, gives what a loop over ``step`` gives; that the layer can be
-    copied. It draws from no random generator of the process, and the layer that a network gets is another one.
+    currents; that ``run``, if the class has its own, gives what a loop over ``step`` gives; that ``node``, likewise,
+    gives a description with a number for every channel; that the layer can be copied. It draws from no random
+    generator of the process, and the layer that a network gets is another one.
 
     Args:
         model: the class.
@@ -46,6 +53,8 @@ def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) 
             shapes.append((4, 16, 3, 3))
         for shape in shapes:
             _Played(layer, shape, config.threshold).check()
+        if model.node is not NeuronLayer.node:
+            _check_node(layer)
         try:
             copy.deepcopy(layer)
         except Exception as error:
@@ -74,6 +83,34 @@ def _made(model: type[NeuronLayer], config: NetworkConfig) -> NeuronLayer:
     if "_parameters" not in vars(layer) or not hasattr(layer, "surrogate"):
         _refuse(model, "does not call super().__init__(config)", "it as the first line of __init__(self, config)")
     return layer
+
+
+def _check_node(layer: NeuronLayer) -> None:
+    """The description that exporters and counters read."""
+    model = type(layer)
+    try:
+        node: Any = layer.node(CHANNELS)
+        kind, states = (node.kind, node.states) if isinstance(node, NeuronNode) else (None, None)
+    except SwitchMTError:
+        raise
+    except Exception as error:
+        _refuse(model, f"fails in node ({failure(error)})", "node(self, channels) -> NeuronNode, with kind and states")
+    if not isinstance(node, NeuronNode):
+        _refuse(model, f"returns {_kind(node)} from node({CHANNELS})", "a dataclass derived from NeuronNode")
+    if not isinstance(kind, str):
+        _refuse(model, f"has a node whose kind is {kind!r}", "the model's name, a text")
+    if not (isinstance(states, tuple) and all(isinstance(name, str) for name in states)):
+        _refuse(model, f"has a node whose states are {states!r}", 'a tuple of names, as ("membrane",) with its comma')
+    for field in dataclasses.fields(node):
+        values = getattr(node, field.name)
+        if not field.name.endswith("_O"):
+            continue
+        if not (isinstance(values, np.ndarray) and values.shape == (CHANNELS,) and values.dtype.kind in "fiu"):
+            shown = f"an array of shape {values.shape}" if isinstance(values, np.ndarray) else _kind(values)
+            expected = f"an array of {CHANNELS} numbers, one for each channel, as np.full(channels, value)"
+            _refuse(model, f"has {shown} as {field.name} from node({CHANNELS})", expected)
+        if not bool(np.isfinite(values).all()):
+            _refuse(model, f"has {field.name} = {values.tolist()} from node({CHANNELS})", "finite numbers")
 
 
 class _Played:
