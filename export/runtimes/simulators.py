@@ -47,9 +47,14 @@ class Simulator:
     interpreter: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def missing(self) -> tuple[str, ...]:
+        """The modules that cannot be found."""
+        return tuple(name for name in self.modules if importlib.util.find_spec(name) is None)
+
+    @property
     def installed(self) -> bool:
         """Whether it can be imported."""
-        return all(importlib.util.find_spec(name) is not None for name in self.modules)
+        return not self.missing
 
 
 def _norse(graph: nir.NIRGraph, inputs_TB: Float, dt: float) -> Float:
@@ -158,7 +163,9 @@ SIMULATORS: dict[str, Simulator] = {
         _sinabs,
         {"fires_at_threshold": True},
     ),
-    "snntorch": Simulator(("snntorch",), f"reset to zero, {_ABOVE}", (nir.LIF,), ("spikingjelly",), _snntorch),
+    "snntorch": Simulator(
+        ("snntorch", "nirtorch"), f"reset to zero, {_ABOVE}", (nir.LIF,), ("spikingjelly",), _snntorch
+    ),
 }
 """Simulators that are known to run a network exactly, up to their conventions."""
 
@@ -170,8 +177,8 @@ _COMMON = (nir.Input, nir.Conv2d, nir.Flatten, nir.Affine, nir.Output)
 def skipped(name: str, graph: nir.NIRGraph) -> str | None:
     """Why a simulator is not compared on a graph; None if it is."""
     simulator, dialect = SIMULATORS[name], str(graph.metadata["profile"])
-    if not simulator.installed:
-        return f"{', '.join(simulator.modules)} not installed"
+    if simulator.missing:
+        return f"{', '.join(simulator.missing)} not installed"
     if dialect not in simulator.dialects:
         return f"does not take the dialect {dialect}, only {', '.join(simulator.dialects)}"
     known = (*_COMMON, *simulator.neurons)
