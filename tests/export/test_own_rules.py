@@ -20,7 +20,6 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export import check_parity, to_onnx
 from switchmt_snn.export.formats.onnx_encodings import RULES, encoding_rule
 from switchmt_snn.export.formats.onnx_graph import Graph
-from switchmt_snn.export.parity.dyadic import round_neurons, threshold_of
 from switchmt_snn.spiking.encodings import Encoding
 from tests.export.export_cases import RunCommand, make_agent, observations
 from tests.recipes import code_of
@@ -186,30 +185,7 @@ def test_an_own_neuron_with_rules_is_exported_compared_and_counted(recipes: Path
 
 
 def test_an_own_neuron_with_dyadic_rules_is_compared_bitwise(recipes: Path) -> None:
-    import my_exported_neurons
-
-    neuron = my_exported_neurons.ExportedPartialReset
-
-    class Bitwise(neuron):  # type: ignore[misc, valid-type]
-        def __init__(self, config: Any) -> None:
-            super().__init__(config)
-            del self.threshold
-            self.register_buffer("threshold", torch.tensor(config.threshold))
-
-        def node(self, channels: int) -> Any:
-            values = (np.full(channels, float(value.detach())) for value in (self.threshold, self.amount))
-            return my_exported_neurons.PartialResetNode(*values)
-
-    @round_neurons.register(Bitwise)
-    def _(layer: Any) -> None:
-        layer.amount.copy_(torch.round(layer.amount * 8) / 8)
-
-    @threshold_of.register(Bitwise)
-    def _(layer: Any) -> Any:
-        return layer.threshold
-
-    my_exported_neurons.Bitwise = Bitwise
-    agent = make_agent(neuron="my_exported_neurons:Bitwise")
+    agent = make_agent(neuron="my_bitwise_neurons:BitwisePartialReset")
     result = check_parity(agent, {name: observations(agent, 8) for name in agent.suite.names}, dialect="exact")
     assert result["failures"] == []
     assert result["dyadic_skipped"] is None

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -17,11 +18,11 @@ from safetensors.torch import load_file
 from switchmt_snn.config import ExperimentConfig, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.learning.events import SwitchDecided
-from switchmt_snn.learning.switching import Stay
+from switchmt_snn.learning.switching import EpisodeRecord, Stay
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.run import train
-from tests.recipes import code_of
+from tests.recipes import EXTENDING, code_of
 
 STEPS = 400
 
@@ -54,6 +55,13 @@ def in_fresh_process(folder: Path, *command: str) -> None:
 
 def rows(run: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((run / "switches.csv").read_text().splitlines()))
+
+
+def test_the_recipe_lists_every_field_of_an_episode_record() -> None:
+    listed = re.findall(
+        r"^\| `(\w+)(?:\(\))?` \|", EXTENDING.read_text().split("`EpisodeRecord`:")[1].split("\n\n")[1], re.M
+    )
+    assert listed == [field.name for field in fields(EpisodeRecord)]
 
 
 @pytest.mark.slow
