@@ -116,6 +116,8 @@ class NetworkConfig:
             "the mean over quantiles of largest membranes is not linear in the head",
         )
         require(self.threshold > 0.0, "network.threshold", self.threshold, "above 0")
+        slope = self.surrogate_slope
+        require(slope is None or slope > 0.0, "network.surrogate_slope", slope, "above 0, or null")
         current = self.stream_current_thresholds
         require(current > 0.0, "network.stream_current_thresholds", current, "above 0")
         require(0.0 < self.event_threshold < 1.0, "network.event_threshold", self.event_threshold, "within (0, 1)")

@@ -68,6 +68,7 @@ class SwitchingConfig:
             require(value >= 1, f"switching.{name}", value, "at least 1")
         w = self.plateau_window_episodes
         require(w >= 3, "switching.plateau_window_episodes", w, "at least 3", "a slope with an error needs 3 points")
+        require(self.plateau_t >= 0, "switching.plateau_t", self.plateau_t, "at least 0")
         require(self.change_threshold > 0, "switching.change_threshold", self.change_threshold, "above 0")
         f = self.change_rate_fraction
         require(0 < f < 1, "switching.change_rate_fraction", f, "within (0, 1)")

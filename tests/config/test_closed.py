@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from switchmt_snn.cli import main
-from switchmt_snn.config import ExperimentConfig, LearningConfig, NetworkConfig, from_dict, resolve
+from switchmt_snn.config import ExperimentConfig, LearningConfig, NetworkConfig, SwitchingConfig, from_dict, resolve
 from switchmt_snn.config.checks import accepts_plugins, choices, field_types
 from switchmt_snn.errors import ConfigError
 
@@ -102,12 +102,20 @@ def test_a_learning_config_made_in_python_is_checked(change: dict[str, Any], mes
         ({"neuron": "ALIFX"}, "network.neuron is 'ALIFX', expected one of IF, LIF"),
         ({"encoding": "raet"}, "did you mean 'rate'?"),
         ({"surrogate_slope": "steep"}, "network.surrogate_slope is 'steep', expected a finite number"),
+        ({"surrogate_slope": -5.0}, "network.surrogate_slope is -5.0, expected above 0, or null"),
+        ({"surrogate_slope": 0.0}, "network.surrogate_slope is 0.0, expected above 0, or null"),
     ],
 )
 def test_a_network_config_made_in_python_is_checked(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         NetworkConfig(**change)
     assert message in str(caught.value)
+
+
+def test_a_plateau_cannot_be_below_every_slope() -> None:
+    with pytest.raises(ConfigError, match=r"switching.plateau_t is -1.0, expected at least 0"):
+        SwitchingConfig(plateau_t=-1.0)
+    assert SwitchingConfig(plateau_t=0.0).plateau_t == 0.0
 
 
 def test_python_and_yaml_store_the_same_types() -> None:
