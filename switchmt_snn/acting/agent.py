@@ -55,6 +55,7 @@ class Agent:
 
         Args:
             observation: raw, ``suite.observation_shape`` (Atari: uint8 ``[4, 84, 84]``, oldest frame first) or a batch.
+                Without stacked frames also one image as its environment gives it: ``[H, W]`` or ``[H, W, c]``.
             task: name or index.
 
         Raises:
@@ -62,6 +63,7 @@ class Agent:
         """
         index = self.suite.index(task)
         expected = self.suite.observation_shape
+        observation = self._channels_first(observation)
         batch = observation[None] if observation.shape == expected else observation
         if batch.shape[1:] != expected:
             raise TaskError(
@@ -76,6 +78,15 @@ class Agent:
             q_BA = q_BA.masked_fill(self._invalid_KA[index], -torch.inf)
         values: npt.NDArray[np.float32] = q_BA.cpu().numpy()
         return values[0] if observation.shape == expected else values
+
+    def _channels_first(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """One image whose shape says that its channels are last, or left out, with its channels first."""
+        channels, *image = self.suite.observation_shape
+        if len(image) != 2 or self.suite.frame_stack != 1 or observation.shape == self.suite.observation_shape:
+            return observation
+        if channels == 1 and observation.shape == tuple(image):
+            return observation[None]
+        return np.moveaxis(observation, -1, 0) if observation.shape == (*image, channels) else observation
 
     def act(self, observation: npt.NDArray[Any], task: str | int) -> Any:
         """The greedy action (an int) for one observation, or ``[B]`` for a batch, as the environment takes it.

@@ -33,6 +33,7 @@ from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.machine.cores import Parts, parts
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.atari import AtariSuite
+from switchmt_snn.tasks.gym_make import make_environment
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import Reference, TaskSuite
 from switchmt_snn.viewing.tables import published_rows
@@ -240,6 +241,19 @@ def test_an_agent_acts_as_the_environment_counts_actions() -> None:
     assert np.array_equal(agent.act(batch, 0), greedy - 1)
     assert agent.act(batch[0], 0) == greedy[0] - 1
     assert metadata(fold_agent(agent))["first_actions"] == {"tests.tasks.odd_envs:Offset-v0": -1}
+
+
+@pytest.mark.parametrize("env_id", ["Grey-v0", "ChannelsLast-v0", "ChannelsFirst-v0", "Planes-v0"])
+def test_an_agent_takes_the_images_of_its_environment(env_id: str) -> None:
+    """The loop of docs/extending.md, compared with the frame that training makes of the same observation."""
+    name = f"tests.tasks.odd_envs:{env_id}"
+    config = small_config(tasks={"suite": "gym", "names": [name]})
+    suite = make_suite(config.tasks)
+    agent = Agent(build_network(config.network, observation_spec(suite), 3), suite, config, torch.device("cpu"), 12)
+    observation, _ = make_environment(name).reset(seed=4)
+    frame = suite.make(0, 1).reset(np.zeros(1, np.int64), np.asarray([4]))[0]
+    assert np.array_equal(agent.q_values(observation, name), agent.q_values(frame, name))
+    assert isinstance(agent.act(observation, name), int)
 
 
 def test_protocol_is_said_in_words() -> None:

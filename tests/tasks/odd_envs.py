@@ -153,6 +153,15 @@ class AnyAxis(Plain):
         return np.broadcast_to(np.arange(10, dtype=np.uint8), (10, 10, 10))
 
 
+class Grey(Plain):
+    """Images without an axis of channels."""
+
+    observation_space = Box(0, 255, (10, 10), np.uint8)
+
+    def observe(self) -> Any:
+        return np.arange(100, dtype=np.uint8).reshape(10, 10)
+
+
 class Planes(Plain):
     """Truth values, as MinAtar's own ids give them."""
 
