@@ -27,7 +27,7 @@ from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.memory import MemoryEstimate, require_gpu_memory, require_memory
 from switchmt_snn.spiking.encoding_check import try_encoding
-from switchmt_snn.tasks.check import check_before_training
+from switchmt_snn.tasks.check import check_before_training, warnings_unless_refused
 from switchmt_snn.tasks.registry import make_suite, suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 from switchmt_snn.updates.engine import ENGINES
@@ -78,8 +78,9 @@ def plan(
         device = select_device(config.device)
     if is_plugin(config.switching.policy):
         check_policy(config.switching)
-    suite = make_suite(config.tasks)
-    warnings = check_before_training(config.tasks, suite, config.learning.clip_rewards)
+    with warnings_unless_refused():
+        suite = make_suite(config.tasks)
+        warnings = check_before_training(config.tasks, suite, config.learning.clip_rewards)
     if is_plugin(config.network.encoding):
         try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)
     config, notes = decide(config, stored, suite, device, processes)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import numpy.typing as npt
 
@@ -13,6 +17,15 @@ from switchmt_snn.tasks.suite import TaskSuite
 
 STEPS_BEFORE_TRAINING = 20
 """Steps per task for which tasks from outside are played before a run starts."""
+
+
+@contextmanager
+def warnings_unless_refused() -> Iterator[None]:
+    """Show the warnings of a block (Gymnasium's checker) after it, and none if it raises: a refusal is one line."""
+    with warnings.catch_warnings(record=True) as caught:
+        yield
+    for seen in caught:
+        warnings.warn_explicit(seen.message, seen.category, seen.filename, seen.lineno)
 
 
 def check_before_training(config: TasksConfig, tasks: TaskSuite, clips_rewards: bool) -> tuple[str, ...]:

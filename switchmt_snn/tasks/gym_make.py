@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,9 +11,11 @@ import numpy as np
 
 from switchmt_snn.config.plugins import failure, import_plugin_module, is_plugin, load_plugin
 from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
-from switchmt_snn.errors import TaskError, did_you_mean
+from switchmt_snn.errors import TaskError, did_you_mean, nearest
 from switchmt_snn.tasks.gym_copies import Env
 
+_FORM = re.compile(r"([\w.]+:)?([\w-]+/)?[\w.-]+")
+"""Of an id: the module that registers it, Gymnasium's namespace, the name."""
 MOST_COMBINATIONS = 512
 """Most actions that ``FlattenAction`` makes: a Q-network has an output for each."""
 
@@ -77,6 +80,11 @@ def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
         >>> make_environment("Blackjack-v1", ["FlattenObservation"]).observation_space.shape
         (45,)
     """
+    if not _FORM.fullmatch(name):
+        raise TaskError(
+            f"tasks.names has {name!r}, expected an id such as CartPole-v1, or module:Id, such as my_module:MyEnv-v0, "
+            "which imports my_module first"
+        )
     module, colon, env_id = name.partition(":")
     if colon:
         _import(name, module)
@@ -135,7 +143,10 @@ def _hint(name: str) -> str:
     """Near ids: after ``module:``, of those whose class lies in the module."""
     module, colon, _ = name.partition(":")
     if not colon:
-        return f"{did_you_mean(name, gymnasium.registry)}; an id that another package registers is named package:Id"
+        return (
+            f"; an id that a module registers is named module:Id, such as my_module:{name}"
+            f"{nearest(name, gymnasium.registry)}"
+        )
     own = [
         f"{module}:{env_id}"
         for env_id, spec in gymnasium.registry.items()

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 
 from switchmt_snn import check_env
 from switchmt_snn.cli.entry import main
-from switchmt_snn.config import TasksConfig
+from switchmt_snn.config import TasksConfig, from_dict
 from switchmt_snn.errors import TaskError
-from switchmt_snn.tasks.check import check_before_training
+from switchmt_snn.runs.plan import plan
+from switchmt_snn.tasks.check import check_before_training, warnings_unless_refused
 from switchmt_snn.tasks.registry import SUITES, make_suite
 from switchmt_snn.tasks.report import EnvironmentReport
 
@@ -110,7 +114,10 @@ def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> Non
     [
         ([], "was given no environment"),
         ([f"{MODULE}:FloatGrid-v0"], "tasks.wrappers=[FlattenObservation]"),
-        (["Nothing-v0"], "unknown Gymnasium id"),
+        (["Nothing-v0"], "named module:Id, such as my_module:Nothing-v0"),
+        ([f"{MODULE}:Plain-v0:x"], "has '" + MODULE + ":Plain-v0:x', expected an id such as CartPole-v1, or module:Id"),
+        ([f"{MODULE}:"], "expected an id such as CartPole-v1, or module:Id"),
+        (["CartPole-v9"], "did you mean 'CartPole-v1'?"),
         (["CartPole-v1", "--steps", "0"], "--steps is 0"),
     ],
 )
@@ -123,6 +130,31 @@ def test_the_command_refuses_in_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+class WrongShape(gymnasium.Env[Any, Any]):
+    """Gymnasium's checker warns of its observations."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (3,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros(4, np.float32), {}
+
+
+gymnasium.register("WrongShape-v0", WrongShape)
+
+
+def test_warnings_are_shown_after_the_checks_and_not_with_a_refusal() -> None:
+    config = from_dict({"tasks": {"suite": "gym", "names": [f"{__name__}:WrongShape-v0"]}})
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        with pytest.raises(TaskError, match=r"observation of shape \(4,\)"):
+            plan(config)
+        assert heard == []
+        with warnings_unless_refused():
+            warnings.warn("kept", stacklevel=1)
+    assert [str(seen.message) for seen in heard] == ["kept"]
 
 
 def test_a_run_says_before_it_starts_that_an_environment_does_not_repeat_itself() -> None:
