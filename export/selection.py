@@ -36,7 +36,8 @@ class Selection:
         if not names:
             return cls(tuple(known.values()), tuple(chips.values()))
         found: list[Target | Chip] = []
-        for name in dict.fromkeys(map(str, names)):
+        _require_each_once(list(map(str, names)))
+        for name in map(str, names):
             if Path(name).suffix in SUFFIXES:
                 found.append(_own_name(_read(name), name))
             elif name in known or name in chips:
@@ -71,6 +72,12 @@ def _own_name(read: Target | Chip, file: str) -> Target | Chip:
             "own; change the name in your file"
         )
     return read
+
+
+def _require_each_once(names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"the target {name!r} is named {names.count(name)} times, expected each once")
 
 
 def _require_different_names(what: str, names: list[str]) -> None:

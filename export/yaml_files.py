@@ -116,6 +116,13 @@ class Section:
             raise self.wrong(key, f"a text{why}")
         return value
 
+    def short_name(self, key: str) -> str:
+        """A text that names the file's subject in tables and lists."""
+        value = self.text(key)
+        if not value.isprintable() or set(value) & set("/\\,"):
+            raise self.wrong(key, "a name of one line without /, \\ and commas, such as my-target")
+        return value
+
     def choice(self, key: str, allowed: Sequence[str]) -> str:
         """One of the allowed texts."""
         value = self.raw[key]

@@ -63,6 +63,7 @@ def read_chip(raw: Any, where: str) -> Chip:
         raise file.wrong("limits", "at least one limit")
     state_bits = file.whole("state_bits", 1, 64, "bits") if "state_bits" in file else None
     name, title, vendor, source = (file.text(key, "; every constant needs its origin") for key in _TEXTS)
+    file.short_name("name")
     return Chip(
         name=name,
         title=title,

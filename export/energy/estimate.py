@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -240,16 +241,20 @@ def read_target(raw: Any, where: str) -> Target:
     """A target from the keys and values of its file.
 
     Raises:
-        ConfigError: a key is missing or unknown, a text is empty, a constant is negative, or a unit is not known.
+        ConfigError: a key is missing or unknown, a text is empty, a constant is negative, accumulations are free, a
+            larger memory is cheaper than a smaller one, or a unit is not known.
     """
     file = Section(where, raw, "", (*_TEXTS, "evidence", "unit", "operations"), ("kind", "memory"))
     if "kind" in file:
         file.choice("kind", ("energy",))
     texts = {key: file.text(key, "; every constant needs its origin") for key in _TEXTS}
+    file.short_name("name")
     evidence = file.choice("evidence", EVIDENCE)
     factor = UNITS_PJ[file.choice("unit", tuple(UNITS_PJ))]
     prices = file.section("operations", ("ac",), _OPERATIONS)
     operations = {name: prices.number(name) * factor for name in prices.raw}
+    if operations["ac"] == 0:
+        raise prices.wrong("ac", "a number above 0: spikes cost accumulations")
     memory = _memory(file.section("memory", _MEMORY), factor) if "memory" in file else None
     return Target(**texts, evidence=evidence, operations_pj=operations, memory=memory)
 
@@ -262,5 +267,12 @@ def _memory(section: Section, factor: float) -> Memory:
         float(check_number(levels.where, "a size of memory.energy_by_kilobytes", size)): levels.number(size) * factor
         for size in levels.raw
     }
+    by_size = sorted(energies.items())
+    for (small, low), (large, high) in pairwise(by_size):
+        if high < low:
+            raise ConfigError(
+                f"{section.where}: memory.energy_by_kilobytes has {high / factor:g} for {large:g} kB and "
+                f"{low / factor:g} for {small:g} kB, expected no less for a larger memory"
+            )
     bits = {key: section.whole(key, 1, 1024, "bits") for key in _MEMORY if key.endswith("_bits")}
-    return Memory(bits["access_bits"], dict(sorted(energies.items())), bits["weight_bits"], bits["state_bits"])
+    return Memory(bits["access_bits"], dict(by_size), bits["weight_bits"], bits["state_bits"])

@@ -278,6 +278,17 @@ def test_a_file_cannot_pass_for_a_built_in_target_or_chip(tmp_path: Path) -> Non
     assert Selection.of([target]) == Selection.of(["loihi-2018"])
 
 
+def test_a_target_that_is_named_twice_is_refused() -> None:
+    with pytest.raises(ConfigError, match="the target 'loihi-2' is named 2 times, expected each once"):
+        Selection.of(["loihi-2", "speck", "loihi-2"])
+
+
+def test_a_chips_name_fits_into_tables_and_lists() -> None:
+    for name in ("a/b", "a,b", "a\nb"):
+        with pytest.raises(ConfigError, match="expected a name of one line without /"):
+            chip(name=name)
+
+
 def test_notes_may_be_left_out_or_empty() -> None:
     assert read_chip(changed({"notes": REMOVED}), "my.yaml").notes == ()
     assert chip(notes=[]).notes == ()

@@ -161,6 +161,12 @@ def test_built_in_targets_have_origin_and_price() -> None:
         ({"unit": "calories"}, "unit is 'calories', expected one of fJ, pJ, nJ"),
         ({"source": ""}, "source is '', expected a text"),
         ({"operations": {"ac": -1}}, "operations.ac is -1, expected a number of at least 0"),
+        ({"operations": {"ac": 0}}, "operations.ac is 0, expected a number above 0"),
+        ({"name": "a/b"}, "name is 'a/b', expected a name of one line without /"),
+        (
+            {"memory": {"access_bits": 64, "energy_by_kilobytes": {32: 10, 8: 20}, "weight_bits": 8, "state_bits": 8}},
+            "energy_by_kilobytes has 10 for 32 kB and 20 for 8 kB, expected no less for a larger memory",
+        ),
         ({"operations": {"mac": 1}}, "has no operations.ac"),
         ({"operations": {"ac": 1, "macc": 1}}, "unknown key operations.macc; did you mean 'mac'"),
         ({"operations": {"ac": "1 pJ"}}, "operations.ac is '1 pJ'"),
