@@ -17,7 +17,7 @@ from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.shared_learner import SharedLearner
-from switchmt_snn.learning.switching import Criterion
+from switchmt_snn.learning.switching import Criterion, with_policy
 from switchmt_snn.learning.training import Training, make_learner, observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
@@ -81,9 +81,9 @@ def train(
             stored config; without ``run``, too, it takes the quickstart preset.
         run: run folder. One that holds a run of the same config is continued; None makes a new one under ``runs/``.
         observers: progress displays and the like.
-        policy: a switching criterion of your own in place of the config's. The run stores its name, so that it can be
-            continued (docs/extending.md, Switching policy).
-        suite: a task suite of your own, likewise (docs/extending.md, Task and suite).
+        policy: a switching criterion of your own; it replaces ``switching.policy`` and takes ``switching.options``.
+            The run stores its name, so that it can be continued (docs/extending.md, Switching policy).
+        suite: a task suite of your own; it replaces ``tasks.suite``, likewise (docs/extending.md, Task and suite).
 
     Under ``torchrun`` the first process does all this, and every update is divided among all processes.
 
@@ -121,7 +121,7 @@ def _train(
     stored = folder.config() if folder is not None and folder.is_run else None
     config = _asked(config, folder, stored)
     if policy is not None:
-        config = replace(config, switching=replace(config.switching, policy=plugin_name(policy, "policy")))
+        config = replace(config, switching=with_policy(config.switching, policy))
     if suite is not None:
         config = replace(config, tasks=replace(config.tasks, suite=plugin_name(register_suite(suite), "suite")))
     planned = plan(config, stored) if group is None else plan(config, stored, group.size, group.device(config.device))

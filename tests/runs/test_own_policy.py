@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from switchmt_snn.config import ExperimentConfig, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.learning.events import SwitchDecided
-from switchmt_snn.learning.switching import EpisodeRecord, Stay
+from switchmt_snn.learning.switching import EpisodeRecord, Stay, with_policy
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.run import train
@@ -114,6 +114,21 @@ def test_a_local_class_is_refused_because_no_run_could_name_it(folder: Path) -> 
 
     with pytest.raises(ConfigError, match="expected a class at the top level of a module"):
         train(short(STEPS), folder / "run", policy=Local)
+
+
+def test_an_option_that_the_policy_in_place_of_the_configs_lacks_is_refused(folder: Path) -> None:
+    mine = import_module("my_policies").ReturnAbove
+    (folder / "other_policy.py").write_text(
+        "from my_policies import ReturnAbove\n\n\nclass Other(ReturnAbove):\n"
+        "    def __init__(self, config, goal=1.0):\n        super().__init__(config, goal)\n"
+    )
+    other = import_module("other_policy").Other
+    config = short(STEPS, policy="my_policies:ReturnAbove", options=("target=3",))
+    complaint = r"'target' for the config's policy my_policies:ReturnAbove, which .* by other_policy:Other, .* \(goal\)"
+    with pytest.raises(ConfigError, match=complaint):
+        train(config, folder / "run", policy=other)
+    assert not (folder / "run").exists()
+    assert with_policy(config.switching, mine) == config.switching
 
 
 def decided(reason: str, **measured: float) -> SwitchDecided:

@@ -38,6 +38,7 @@ from switchmt_snn.learning.switching.criterion import (
     criterion_class,
     make_criterion,
     register_criterion,
+    with_policy,
 )
 
 __all__ = [
@@ -60,4 +61,5 @@ __all__ = [
     "parameter_change_per_update",
     "register_criterion",
     "reward_plateau",
+    "with_policy",
 ]

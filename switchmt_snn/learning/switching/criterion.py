@@ -9,13 +9,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor
 
 from switchmt_snn.config import POLICIES, SwitchingConfig
-from switchmt_snn.config.plugins import failure, is_plugin, load_plugin, plugin_options
+from switchmt_snn.config.plugins import failure, is_plugin, load_plugin, plugin_name, plugin_options
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.learning.state import Stateful
 
@@ -183,6 +183,24 @@ def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
                 f"{', '.join(DECISION_COLUMNS)}"
             )
     return criterion
+
+
+def with_policy(config: SwitchingConfig, criterion: type[Criterion]) -> SwitchingConfig:
+    """The settings with a class from outside the package in place of their policy; it takes their options.
+
+    Raises:
+        ConfigError: a class that no config can name, or an option of the replaced policy that it does not have.
+    """
+    name = plugin_name(criterion, "policy")
+    known = inspect.signature(criterion).parameters
+    for option in plugin_options(config.options, "switching.options"):
+        if option not in known:
+            raise ConfigError(
+                f"switching.options has {option!r} for the config's policy {config.policy}, which the argument policy "
+                f"replaces by {name}, expected options that {name} has ({', '.join(list(known)[1:]) or 'none'}); "
+                "replace switching.options, too, or leave the argument out"
+            )
+    return replace(config, policy=name)
 
 
 def make_criterion(config: SwitchingConfig) -> Criterion:
