@@ -23,6 +23,7 @@ from tests.export.export_cases import RunCommand, make_agent, observations
 @pytest.fixture
 def snntorch_file(tmp_path: Path) -> tuple[Path, Path, np.ndarray]:
     """A network of snnTorch with its default reset as its own exporter writes it, inputs, and its own outputs."""
+    pytest.importorskip("nirtorch", reason="snnTorch's exporter needs nirtorch")
     from snntorch.export_nir import export_to_nir
 
     generator = torch.Generator().manual_seed(0)

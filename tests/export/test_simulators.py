@@ -131,8 +131,9 @@ def test_every_cell_of_the_table_is_true(
                 nir_graph(fold_agent(agent), 1, file)
             continue
         module, run = RUNTIMES[runtime]
-        if importlib.util.find_spec(module) is None:
-            pytest.skip(f"{module} is not installed")
+        needed = SIMULATORS[module].modules if module in SIMULATORS else (module,)
+        if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
+            pytest.skip(f"{', '.join(missing)} not installed")
         write_nir(nir_graph(fold_agent(agent), 1, file), tmp_path / "task.nir")
         graph, encoded = read_nir(tmp_path / "task.nir"), np.ascontiguousarray(encode(agent.suite, agent.config, x, 0))
         if module in SIMULATORS:
@@ -159,7 +160,8 @@ def test_a_simulator_that_is_not_compared_says_why() -> None:
     leaky = nir_graph(fold_agent(make_agent(neuron="LIF")), 0)
     reasons = {name: skipped(name, leaky) for name, simulator in SIMULATORS.items() if simulator.installed}
     assert reasons.get("norse") is None
-    assert reasons["snntorch"] == "does not take the dialect portable, only spikingjelly"
+    only = "does not take the dialect portable, only spikingjelly"
+    assert reasons.get("snntorch", only) == only
     assert reasons.get("sinabs", "refuses LIF").startswith("refuses LIF")
     loops = nir_graph(fold_agent(make_agent(reset="subtract")), 0, "exact")
     assert {name for name in SIMULATORS if skipped(name, loops) is None} <= {"nirtorch"}
