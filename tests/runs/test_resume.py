@@ -187,7 +187,7 @@ def test_ctrl_c_stops_cleanly_and_continues_exactly(config: Path, whole: Path, t
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 130, output
     assert "Traceback" not in output
-    assert f"continue exactly here with: switchmt-snn train --run {folder}" in output
+    assert f"continue exactly here with: {' '.join(COMMAND)} train --run {folder}" in output
     run("train", "--run", folder)  # without a config: the stored one
     assert content(folder) == content(whole)
 
