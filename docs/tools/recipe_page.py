@@ -62,7 +62,8 @@ conv1. Statistics that are estimated anew at each copy cure targets, which were 
 The rest is the lag of deeper layers of the network that acts and chooses. Running statistics of two batches
 (`normalization_momentum: 0.5`) do not cure it: conv2's mean moves by some hundredths of a standard deviation at each
 update. Single batches give nearly the same Q-values as many (correlation 0.95 to 0.97 on Pong and Breakout), so noise
-is not what limits them. One seed, different steps: **first looks.**
+is not what limits them. Config and returns of the three stopped runs, in this order: `statistics/try2` to `try4`. One
+seed, different steps: **first looks.**
 """
 
 READING = """\
