@@ -19,7 +19,7 @@ EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncat
 
 
 class RunLogs:
-    """An observer that writes events down.
+    """An observer that writes events down, each as one whole line at once: who reads a log sees all that happened.
 
     Numbers are written so that they read back as the same ones. Rows follow the header of their file, also that of an
     older version.
@@ -38,10 +38,13 @@ class RunLogs:
                 None begins the logs.
 
         Raises:
-            RunFolderError: a file that is continued has no column for one of the numbers.
+            RunFolderError: a file that is continued is missing, is shorter than at the checkpoint, or has no column for
+                one of the numbers. No file is changed then.
         """
         self._tasks = task_names
         self._started = time.monotonic()
+        if sizes is not None:
+            _require_bytes(folder, sizes)
         tables = {"episodes.csv": EPISODE_COLUMNS, "switches.csv": (*DECISION_COLUMNS, *measured)}
         if sizes is not None:
             tables = {name: _header(folder / name, columns) for name, columns in tables.items()}
@@ -117,8 +120,24 @@ class RunLogs:
             stream.close()
 
 
+def _require_bytes(folder: Path, sizes: dict[str, int]) -> None:
+    """Refuse logs that lack what they had at the checkpoint; cutting such a file "back" would fill it with zeros.
+
+    Raises:
+        RunFolderError: naming the file.
+    """
+    for name, expected in sizes.items():
+        path = folder / name
+        seen = path.stat().st_size if path.is_file() else None
+        if seen is None or seen < expected:
+            raise RunFolderError(
+                f"{path} {'is missing' if seen is None else f'has {seen:,} bytes'}, expected at least the {expected:,} "
+                "bytes that it had at the checkpoint; put the file back, or begin another run with --run"
+            )
+
+
 def _opened(path: Path, sizes: dict[str, int] | None) -> IO[str]:
-    stream = path.open("a", encoding="utf-8", newline="")
+    stream = path.open("a", buffering=1, encoding="utf-8", newline="")  # 1: line by line
     stream.truncate(0 if sizes is None else sizes[path.name])
     return stream
 

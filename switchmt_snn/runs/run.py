@@ -239,9 +239,9 @@ class _Driver:
                     training.reestimate_statistics()
                 self._save()
         finally:
-            logs.close()
             for observer in self.observers:
                 observer.stop()
+            logs.close()
         if stopped:
             return RunResult(path, "stopped", training.steps, None)
         return RunResult(path, "finished", training.steps, self._evaluate(self._final_evaluation()))

@@ -41,6 +41,8 @@ class TensorBoard:
             for name, value in values.items():
                 if value is not None:
                     self._writer.add_scalar(name, value, event.step)
+        if isinstance(event, EpisodeEnded | Measured):
+            self._writer.flush()  # else points wait up to two minutes
 
     def note(self, text: str) -> None:
         """Not shown here."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import os
 import random
@@ -167,6 +168,46 @@ def test_a_compiled_run_continues_exactly_in_another_process(
     run("train", config, "--run", tmp_path / "parts", *options, "--total-steps", "700")
     run("train", config, "--run", tmp_path / "parts", *options)
     assert content(tmp_path / "parts") == content(tmp_path / "whole")
+
+
+def test_logs_are_whole_lines_while_a_run_goes_on_and_when_it_is_killed(
+    config: Path, whole: Path, tmp_path: Path
+) -> None:
+    """Before the first checkpoint, and long before a buffer of the system would be full."""
+    folder, episodes = tmp_path / "run", tmp_path / "run" / "episodes.csv"
+    options = ("--recording.checkpoint-every-steps", "1600", "--recording.metrics-every-steps", "20")
+    process = subprocess.Popen([*COMMAND, "train", config, "--run", folder, *options], stdout=subprocess.DEVNULL)
+    wait_for(lambda: episodes.exists() and episodes.read_bytes().count(b"\n") > 3, process)
+    alive = process.poll() is None
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert alive, "lines came while it ran"
+    assert not list(folder.glob("checkpoints/step-*"))
+    assert episodes.stat().st_size < 4096
+    killed = {name: (folder / name).read_text() for name in ("episodes.csv", "switches.csv", "metrics.jsonl")}
+    assert all(text.endswith("\n") for text in killed.values())
+    steps = [json.loads(line)["step"] for line in killed["metrics.jsonl"].splitlines()]
+    assert steps == list(range(20, steps[-1] + 1, 20))
+    assert int(killed["episodes.csv"].splitlines()[-1].split(",")[0]) - steps[-1] < 20
+    first = [row for row in content(whole)["episodes.csv"] if int(row["step"]) <= steps[-1]]
+    seen = [
+        {k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(io.StringIO(killed["episodes.csv"]))
+    ]
+    assert seen[: len(first)] == first
+
+
+def test_logs_that_lost_lines_are_refused_in_one_line(config: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = start(config, folder)
+    wait_for(lambda: any(folder.glob("checkpoints/step-*")), process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    path = folder / "switches.csv"
+    kept = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(kept[:2]))
+    result = run("train", config, "--run", folder, check=2)
+    assert f"{path} has {path.stat().st_size:,} bytes, expected at least the" in result.stderr
+    assert path.read_text() == "".join(kept[:2]), "never filled with zeros"
 
 
 def test_killed_while_a_checkpoint_is_written(config: Path, whole: Path, tmp_path: Path) -> None:
