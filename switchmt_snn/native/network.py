@@ -163,7 +163,7 @@ class NativeNetwork:
             ``[B, A]``, or ``[B, M, A]`` with several quantiles, for ``x``; Q-values ``[B, A]`` for each other input.
         """
         if training and torch.is_grad_enabled():
-            outputs = _Decision.apply(self, x, parameters, other_inputs, statistics, *self._differentiated)  # type: ignore[no-untyped-call]
+            outputs = _Decision.apply(self, x, parameters, other_inputs, statistics, *self._differentiated)  # type: ignore[no-untyped-call, unused-ignore]
         else:
             of_x: Statistics = "moving" if training else statistics
             with torch.no_grad():

@@ -71,7 +71,7 @@ class ProcessGroup:
 
     def sum(self, x: Tensor) -> Tensor:
         """The sum of all processes' ``x``, differentiable; every process must call it."""
-        total: Tensor = _SumOverProcesses.apply(x)  # type: ignore[no-untyped-call]
+        total: Tensor = _SumOverProcesses.apply(x)  # type: ignore[no-untyped-call, unused-ignore]
         return total
 
     def announce(self, what: int, task: int = 0) -> None:

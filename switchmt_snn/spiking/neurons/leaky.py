@@ -112,7 +112,7 @@ class LeakyLayer(NeuronLayer):
             return over_time(self.step, current, state)
         # The two parameters are constants; reading them as floats keeps the step free of broadcasts.
         beta, threshold = float(self.leaky.beta.clamp(0, 1)), float(self.leaky.threshold)
-        spikes, membrane = _FusedLeaky.apply(  # type: ignore[no-untyped-call]
+        spikes, membrane = _FusedLeaky.apply(  # type: ignore[no-untyped-call, unused-ignore]
             current, *state, beta, threshold, self.reset == "zero", self.surrogate_gradient
         )
         return spikes, (membrane,)
