@@ -34,6 +34,7 @@ def small_config(**changes: dict[str, Any] | Any) -> ExperimentConfig:
         "learning": {
             "batch_size": 8,
             "learning_rate": 0.003,
+            "clip_rewards": True,
             "learning_starts_steps": 20,
             "replay_capacity_steps": 500,
             "target_update_every_steps": 50,

@@ -41,6 +41,29 @@ def _whole_numbers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | N
     )
 
 
+_TRUTHS = {"true": True, "false": False, "null": None, "none": None}
+
+
+@_REGISTRY.primitive_rule
+def _truth_or_null(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A truth value that may be left open: true, false or null, as in YAML."""
+    if info.type != bool | None:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{true,false,null}",
+        instance_from_str=lambda words: _truth(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, bool),
+        str_from_instance=lambda value: ["null" if value is None else str(value).lower()],
+    )
+
+
+def _truth(word: str) -> bool | None:
+    if word.lower() not in _TRUTHS:
+        raise ValueError(f"{word!r} is not true, false or null")
+    return _TRUTHS[word.lower()]
+
+
 def split(kind: Any, argv: list[str], command: str, default: Any) -> tuple[list[str], list[str]]:
     """The positional arguments, wherever they stand, and the flags with their values.
 

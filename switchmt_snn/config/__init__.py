@@ -5,7 +5,7 @@ Every field is a YAML key and a command-line flag. The text under a field is its
 
 from switchmt_snn.config.documentation import field_documentation
 from switchmt_snn.config.evaluation import EvaluationConfig, RecordingConfig
-from switchmt_snn.config.experiment import ExperimentConfig, resolve
+from switchmt_snn.config.experiment import ExperimentConfig, clips_rewards, resolve
 from switchmt_snn.config.learning import Engine, LearningConfig
 from switchmt_snn.config.methods import METHOD_TRAITS, METHODS, Method, MethodTraits
 from switchmt_snn.config.network import NetworkConfig
@@ -32,6 +32,7 @@ __all__ = [
     "SuiteDefaults",
     "SwitchingConfig",
     "TasksConfig",
+    "clips_rewards",
     "differences",
     "field_documentation",
     "from_dict",

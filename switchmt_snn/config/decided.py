@@ -80,6 +80,7 @@ _OPEN: dict[str, Any] = {
     "network.trunk": "auto",
     "network.hidden_units": None,
     "network.dendrites": "auto",
+    "learning.clip_rewards": None,
     "switching.policy": "auto",
 }
 """Settings for which ``resolve`` has a rule, with the values that leave them open."""

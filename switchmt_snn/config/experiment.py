@@ -83,6 +83,12 @@ class ExperimentConfig:
         )
 
 
+def clips_rewards(config: ExperimentConfig) -> bool:
+    """Whether rewards are clipped for learning; null takes the suite's default."""
+    asked = config.learning.clip_rewards
+    return suite_defaults(config.tasks.suite).clip_rewards if asked is None else asked
+
+
 def resolve(config: ExperimentConfig) -> ExperimentConfig:
     """Replace every ``auto`` and null that has a rule; idempotent. A run stores the resolved config.
 
@@ -106,5 +112,6 @@ def resolve(config: ExperimentConfig) -> ExperimentConfig:
         config,
         tasks=replace(tasks, suite=stored_suite_name(tasks.suite), frame_stack=resolved_frame_stack(tasks)),
         network=network,
+        learning=replace(config.learning, clip_rewards=clips_rewards(config)),
         switching=replace(config.switching, policy=traits.switching if policy == "auto" else policy),
     )

@@ -54,8 +54,9 @@ class LearningConfig:
     acting: Literal["auto", "eager", "native"] = "auto"
     """Who computes the actions of training. eager: PyTorch in float32. native: the native engine, in the precision of
     its updates. Evaluation is always eager. auto: native with engine native, else eager."""
-    clip_rewards: bool = True
-    """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward."""
+    clip_rewards: bool | None = None
+    """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward. null takes the
+    suite's choice: atari and minatar true, gym false."""
     return_normalization: Literal["none", "per_task"] = "none"
     """per_task: divide the TD errors of each task by the size of its returns, so that tasks with large returns do not
     outweigh the others. Q-values stay in the task's rewards; the loss is in these units (docs/algorithm.md, 32)."""

@@ -18,16 +18,18 @@ class SuiteDefaults:
     Attributes:
         frame_stack: newest frames that form one observation (``tasks.frame_stack: null``).
         trunk: feature layers (``network.trunk: auto``): ``nature``, ``minatar`` or ``mlp``.
+        clip_rewards: whether rewards are clipped to [-1, 1] for learning (``learning.clip_rewards: null``).
     """
 
     frame_stack: int
     trunk: str
+    clip_rewards: bool = False
 
 
 SUITE_DEFAULTS: dict[str, SuiteDefaults] = {
-    "atari": SuiteDefaults(frame_stack=4, trunk="nature"),
-    "minatar": SuiteDefaults(frame_stack=1, trunk="minatar"),
-    "gym": SuiteDefaults(frame_stack=1, trunk="mlp"),
+    "atari": SuiteDefaults(frame_stack=4, trunk="nature", clip_rewards=True),
+    "minatar": SuiteDefaults(frame_stack=1, trunk="minatar", clip_rewards=True),
+    "gym": SuiteDefaults(frame_stack=1, trunk="mlp", clip_rewards=False),
 }
 """By name: the built-in suites, and those that ``register_suite`` added."""
 

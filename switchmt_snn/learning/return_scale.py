@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.config import ExperimentConfig, clips_rewards
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.state import Stateful
 
@@ -58,6 +58,6 @@ def make_return_scales(config: ExperimentConfig, num_tasks: int) -> list[ReturnS
     if learning.return_normalization == "none":
         return []
     if learning.return_normalization == "per_task":
-        scale = (config.tasks.num_envs, learning.discount, learning.clip_rewards)
+        scale = (config.tasks.num_envs, learning.discount, clips_rewards(config))
         return [ReturnScale(*scale) for _ in range(num_tasks)]
     raise ConfigError(f"learning.return_normalization is {learning.return_normalization!r}, expected none or per_task")

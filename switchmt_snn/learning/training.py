@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.config import ExperimentConfig, clips_rewards
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
@@ -183,7 +183,7 @@ class Training(Stateful):
     def _learn(self) -> None:
         """The updates that are due, from the current task's buffer or from every task's in turn."""
         learning = self.config.learning
-        returns = Returns(learning.n_steps, learning.discount, learning.clip_rewards)
+        returns = Returns(learning.n_steps, learning.discount, clips_rewards(self.config))
         updates = self.update_clock.advance(self.num_envs) * learning.updates_per_round
         if updates > 0:
             for task, scale in enumerate(self.return_scales):

@@ -3,7 +3,7 @@
 In this order:
 
 - ``resolve``: what follows from the config alone (policy, dendrites, T of an ANN) and from the
-  suite's defaults (trunk, hidden units, frame stack).
+  suite's defaults (trunk, hidden units, frame stack, clipped rewards). A run that exists keeps its clipping.
 - precision, engine and compression (``decide``), which follow from the machine and from the run's length.
 - memory: a run that cannot fit is refused.
 
@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import torch
 
-from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.config import ExperimentConfig, clips_rewards, resolve
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.switching import check_policy
@@ -71,6 +71,8 @@ def plan(
             run does not fit into memory, or a class from outside the package does not do what it must.
         TaskError: a task does not exist or cannot be learned by a Q-network.
     """
+    if stored is not None and config.learning.clip_rewards is None:
+        config = replace(config, learning=replace(config.learning, clip_rewards=stored.learning.clip_rewards))
     config = resolve(config)
     if stored is not None and config.tasks.image_layout == "by_shape":
         config = replace(config, tasks=replace(config.tasks, image_layout=stored.tasks.image_layout))
@@ -80,7 +82,7 @@ def plan(
         check_policy(config.switching)
     with warnings_unless_refused():
         suite = make_suite(config.tasks)
-        warnings = check_before_training(config.tasks, suite, config.learning.clip_rewards)
+        warnings = check_before_training(config.tasks, suite, clips_rewards(config))
     if is_plugin(config.network.encoding):
         try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)
     config, notes = decide(config, stored, suite, device, processes)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.config import LearningConfig, TasksConfig
+from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.check import differs_from, journal
 from switchmt_snn.tasks.gym_copies import GymCopies
@@ -155,7 +155,7 @@ def _report(config: TasksConfig, tasks: TaskSuite, task: int, steps: int, seed: 
         same_in_threads=_same_in_threads(tasks, task, compared, seed, first),
         steps_per_s=played.steps_per_s,
     )
-    return replace(report, notes=tuple(_notes(report, facts["bounds"])))
+    return replace(report, notes=tuple(_notes(report, facts["bounds"], suite_of(config).defaults.clip_rewards)))
 
 
 class _Played:
@@ -232,7 +232,7 @@ def _gym_facts(config: TasksConfig, task: int) -> dict[str, Any]:
     return facts
 
 
-def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None) -> list[str]:
+def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None, clips: bool) -> list[str]:
     notes = []
     low, high = report.observed
     if not report.repeats:
@@ -268,8 +268,10 @@ def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None) -> lis
     if report.layout == "vector" and max(-low, high) > 100:
         notes.append(f"values up to {max(-low, high):g} reach the network as they are; scale them in a wrapper")
     largest = max(-report.rewards[0], report.rewards[1])
-    if LearningConfig.clip_rewards and largest > 1:
-        notes.append(f"rewards up to {largest:g}: learning.clip_rewards (true by default) clips them to [-1, 1]")
+    if largest > 1:
+        default = f"learning.clip_rewards ({str(clips).lower()} by default in the suite {report.suite})"
+        effect = "clips them to [-1, 1]" if clips else "leaves them; a Huber loss or smaller rewards help"
+        notes.append(f"rewards up to {largest:g}: {default} {effect}")
     return notes
 
 

@@ -161,7 +161,7 @@ class Suite:
 
     Attributes:
         name: short name, a value of ``tasks.suite`` once the suite is registered.
-        defaults: frame stack and trunk where a config leaves them open.
+        defaults: frame stack, trunk and clipping of rewards where a config leaves them open.
         examples: tasks that can be learned together; tests and ``doctor`` use them.
         open_names: whether there are tasks that ``known_tasks`` does not list; else an unknown one is refused.
         packages: distributions whose versions a run stores.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from switchmt_snn.config import ExperimentConfig, LearningConfig, NetworkConfig
+from switchmt_snn.config import ExperimentConfig, NetworkConfig, clips_rewards
 from switchmt_snn.learning.events import Measured
 
 DEAD_SHARE = 0.95
@@ -34,20 +34,21 @@ def health_warnings(measured: Measured, config: ExperimentConfig, largest_return
             warnings[f"saturated {name}"] = (
                 f"layer {name}: {layer.saturated:.0%} of the neurons fire at every step; {remedy}"
             )
-    bound = largest_q(config.learning, largest_return)
+    bound = largest_q(config, largest_return)
     if measured.q is not None and math.isfinite(measured.q) and abs(measured.q) > LARGE_FACTOR * bound:
         warnings["large Q"] = (
             f"mean Q is {measured.q:.3g}, expected at most about {bound:.3g}: values explode; "
-            f"{_remedy_for_large_values(config.learning)}"
+            f"{_remedy_for_large_values(config)}"
         )
     return warnings
 
 
-def largest_q(learning: LearningConfig, largest_return: float) -> float:
+def largest_q(config: ExperimentConfig, largest_return: float) -> float:
     """About the largest |Q| that returns allow: 1 / (1 - discount) with clipped rewards, else the largest return."""
-    if not learning.clip_rewards:
+    discount = config.learning.discount
+    if not clips_rewards(config):
         return max(1.0, largest_return)
-    return 1.0 / (1.0 - learning.discount) if learning.discount < 1.0 else math.inf
+    return 1.0 / (1.0 - discount) if discount < 1.0 else math.inf
 
 
 def _remedy_for_silence(layer: str, network: NetworkConfig) -> str:
@@ -66,12 +67,13 @@ def _remedy_for_saturation(layer: str, network: NetworkConfig) -> str:
     return f"raise network.threshold (now {network.threshold:g})"
 
 
-def _remedy_for_large_values(learning: LearningConfig) -> str:
+def _remedy_for_large_values(config: ExperimentConfig) -> str:
+    learning = config.learning
     remedies = [f"lower learning.learning_rate (now {learning.learning_rate:g})"]
     if learning.loss == "mse":
         remedies.append("use learning.loss=huber")
     if learning.gradient_clip == "none":
         remedies.append("use learning.gradient_clip=norm")
-    if not learning.clip_rewards:
+    if not clips_rewards(config):
         remedies.append("use learning.clip_rewards=true")
     return ", ".join(remedies[:-1]) + " or " + remedies[-1] if len(remedies) > 1 else remedies[0]

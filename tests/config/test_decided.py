@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from switchmt_snn.config import METHOD_TRAITS, METHODS, ExperimentConfig, load_config, resolve, to_yaml
+from switchmt_snn.config import METHOD_TRAITS, METHODS, ExperimentConfig, clips_rewards, load_config, resolve, to_yaml
 from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.errors import ConfigError
 
@@ -68,6 +68,23 @@ def test_the_config_of_an_older_run_can_be_varied(tmp_path: Path) -> None:
         (tmp_path / "environment.json").write_text("{}")
         assert with_method(load_config(path), other) == with_method(original, other)
         assert resolve(load_config(path)) == load_config(path, reopen=False) == resolve(original)
+
+
+@pytest.mark.parametrize(("suite", "clips"), [("atari", True), ("minatar", True), ("gym", False)])
+def test_the_suite_decides_whether_rewards_are_clipped(suite: str, clips: bool, tmp_path: Path) -> None:
+    """Atari's custom does not leak into other suites, and stays open for a variation with another suite."""
+    asked = from_dict({"tasks": {"suite": suite, "names": ["a"]}})
+    assert asked.learning.clip_rewards is None
+    assert resolve(asked).learning.clip_rewards is clips_rewards(asked) is clips
+    assert load_config(written(tmp_path, asked)) == asked
+    for value in (True, False):
+        asked = from_dict({"tasks": {"suite": suite, "names": ["a"]}, "learning": {"clip_rewards": value}})
+        assert resolve(asked).learning.clip_rewards is clips_rewards(asked) is value
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_clips_as_it_did_when_its_results_were_made(preset: str) -> None:
+    assert resolve(load_config(preset)).learning.clip_rewards is (preset not in ("cartpole", "classic"))
 
 
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:

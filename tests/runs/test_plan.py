@@ -159,3 +159,11 @@ def test_a_run_of_an_older_version_is_planned_as_it_was(tmp_path: Path) -> None:
     made = plan(old, old)
     assert plans.decide(made.config, old, made.suite, made.device)[0] == made.config
     assert (made.config.learning.engine, made.config.learning.replay_compression) == ("eager", "none")
+
+
+@pytest.mark.parametrize("begun_with", [True, False])
+def test_a_run_goes_on_clipping_as_it_began(begun_with: bool) -> None:
+    """A gym run of a version that clipped by default is continued by the same config, which does not name it."""
+    stored = plan(cartpole(clip_rewards=begun_with)).config
+    assert plan(cartpole(), stored).config.learning.clip_rewards is begun_with
+    assert plan(cartpole()).config.learning.clip_rewards is False

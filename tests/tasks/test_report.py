@@ -60,7 +60,7 @@ def test_the_facts_of_a_plain_environment() -> None:
         ("SharedState", "the same seed and actions do not give the same play"),
         ("KeepsState", "an episode depends on the episodes before it"),
         ("GlobalRandom", "it draws from the global generators"),
-        ("GlobalRandom", r"rewards up to \S+: learning\.clip_rewards"),
+        ("GlobalRandom", r"rewards up to \S+: learning\.clip_rewards \(false by default in the suite gym\) leaves"),
         ("Endless", "no episode ended in 120 steps, and the environment has no limit"),
         ("Endless", "observations from 0 to 12 leave the space's bounds from -10 to 10"),
         ("Large", "values up to 3000 reach the network as they are"),
