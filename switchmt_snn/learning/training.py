@@ -222,23 +222,24 @@ class Training(Stateful):
                 epsilon=epsilon,
                 updates=self.learner.updates,
             )
-            if switch is None:
-                record = EpisodeRecord(
-                    task=task,
-                    episodes_in_visit=self.episodes_in_visit,
-                    steps_in_visit=self.steps_in_visit,
-                    updates=self.learner.updates,
-                    updates_in_visit=self.updates_in_visit,
-                    episode_return=episode_return,
-                    parameters=self.learner.parameters,
-                )
-                decision = self.policy.end_of_episode(record)
-                yield self._decided(decision)
-                switch = decision if isinstance(decision, SwitchTo) else None
+            record = EpisodeRecord(
+                task=task,
+                episodes_in_visit=self.episodes_in_visit,
+                steps_in_visit=self.steps_in_visit,
+                updates=self.learner.updates,
+                updates_in_visit=self.updates_in_visit,
+                episode_return=episode_return,
+                parameters=self.learner.parameters,
+            )
+            decision = self.policy.judge(record, left=switch is not None)
+            yield self._decided(decision)
+            if isinstance(decision, SwitchTo):
+                switch = decision
         if switch is None and self.policy.must_leave(self.steps_in_visit):
             switch = self.policy.leave(task)
             yield self._decided(switch)
         if switch is not None:
+            self.policy.start_visit()
             self._enter(switch.task)
         else:
             self._begin_episodes()

@@ -70,7 +70,7 @@ class Progress:
         elif isinstance(event, Measured):
             self._loss, self._q = event.loss, event.q
             self._warnings = health_warnings(event, self._training.config, self._largest_return)
-        elif isinstance(event, SwitchDecided):
+        elif isinstance(event, SwitchDecided) and event.decision.reason != "visit_over":
             self._distance = _distance(event)
 
     def note(self, text: str) -> None:

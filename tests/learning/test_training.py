@@ -259,6 +259,45 @@ def test_every_method_learns_the_identity_task(method: str) -> None:
     assert training.learner.act(np.eye(3, dtype=np.float32), 0).tolist() == [0, 1, 2]
 
 
+@pytest.mark.parametrize("max_stay_steps", [None, 30])
+def test_the_policy_sees_every_episode_end_of_a_step_in_which_it_leaves(
+    max_stay_steps: int | None, monkeypatch
+) -> None:
+    """Four copies end their episodes in one step, the policy leaves at the second: the visit is forgotten after all."""
+    config = small_config(
+        total_steps=168,
+        tasks={"num_envs": 4},
+        switching={
+            "policy": "fixed_episodes",
+            "visit_episodes": 2,
+            "max_stay_steps": max_stay_steps,
+            "min_stay_episodes": 2,
+        },
+    )
+    training = counting(config)
+    criterion, seen = training.policy.criterion, []
+    judged = criterion.end_of_episode
+
+    def end_of_episode(record):  # type: ignore[no-untyped-def]
+        seen.append((record.task, record.episodes_in_visit, record.episode_return))
+        return judged(record)
+
+    monkeypatch.setattr(criterion, "end_of_episode", end_of_episode)
+    monkeypatch.setattr(criterion, "start_visit", lambda: seen.append("forgotten"))
+    events = run(training)
+    ended = [event for event in events if isinstance(event, EpisodeEnded)]
+    decided = [event for event in events if isinstance(event, SwitchDecided)]
+    assert len(ended) == 168 // 7, "all copies, at every seventh step"
+    assert [(event.step, event.task) for event in decided] == [(event.step, event.task) for event in ended]
+    expected = []
+    for visit in range(168 // 28):
+        expected += [*((visit % 2, number, 28.0) for number in range(1, 5)), "forgotten"]
+    assert seen == expected
+    reasons = [event.decision.reason for event in decided]
+    assert reasons == ["visit_episodes", "visit_episodes", "visit_over", "visit_over"] * 6
+    assert sum(isinstance(event.decision, SwitchTo) for event in decided) == 6
+
+
 def test_a_loss_that_is_not_finite_stops_the_run() -> None:
     training = counting(small_config(learning={"learning_rate": 1e30, "clip_rewards": False}))
     with pytest.raises(TrainingFailed, match=r"not finite .* try a lower learning\.learning_rate"):

@@ -73,12 +73,32 @@ class SwitchingPolicy(Stateful):
         return self.criterion.columns
 
     def end_of_episode(self, record: EpisodeRecord) -> Stay | SwitchTo:
-        """Decide at an episode's end.
+        """Decide at the end of the only episode that ended in a step; a switch makes the criterion forget the visit.
+
+        Raises:
+            ConfigError: see ``judge``.
+        """
+        decision = self.judge(record)
+        if isinstance(decision, SwitchTo):
+            self.start_visit()
+        return decision
+
+    def judge(self, record: EpisodeRecord, left: bool = False) -> Stay | SwitchTo:
+        """Decide at an episode's end. After a step in which a task was left, ``start_visit`` is due.
+
+        Args:
+            record: of the episode. Those that end in one step are judged in the order of their copies.
+            left: whether another episode of this step ended the visit. The criterion then sees this one, too, and what
+                it measures is reported; nothing more is decided.
 
         Raises:
             ConfigError: the criterion reports a number that it does not declare in ``columns``, or asks for parameters
                 although it declares no ``snapshots``; one from outside the package fails, or returns no ``Verdict``.
         """
+        decision = self._judge(record)
+        return Stay("visit_over", decision.measured) if left else decision
+
+    def _judge(self, record: EpisodeRecord) -> Stay | SwitchTo:
         if self._must_wait(record):
             if self.must_leave(record.steps_in_visit):
                 return self.leave(record.task)
@@ -113,8 +133,13 @@ class SwitchingPolicy(Stateful):
         return limit is not None and self.num_tasks > 1 and steps_in_visit >= limit
 
     def leave(self, task: int) -> SwitchTo:
-        """The switch that ``must_leave`` demands within an episode."""
+        """The switch that ``must_leave`` demands within an episode; ``start_visit`` is due after it."""
         return self._next(task, "max_stay_steps", {})
+
+    def start_visit(self) -> None:
+        """H_i <- []: the criterion forgets the visit that is over."""
+        with criterion_code(self.config.policy, "start_visit"):
+            self.criterion.start_visit()
 
     def state_dict(self) -> dict[str, Any]:
         """The criterion's state.
@@ -129,9 +154,7 @@ class SwitchingPolicy(Stateful):
         return state
 
     def _next(self, task: int, reason: str, measured: dict[str, float]) -> SwitchTo:
-        """i <- (i + 1) mod |E|, H_i <- []."""
-        with criterion_code(self.config.policy, "start_visit"):
-            self.criterion.start_visit()
+        """i <- (i + 1) mod |E|."""
         return SwitchTo((task + 1) % self.num_tasks, reason, measured)
 
     def _checked(self, verdict: Verdict) -> dict[str, float]:

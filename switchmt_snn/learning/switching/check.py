@@ -33,4 +33,5 @@ def check_policy(config: SwitchingConfig) -> None:
             policy.end_of_episode(record)
             policy.state_dict()
         policy.leave(task)
+        policy.start_visit()
         policy.state_dict()
