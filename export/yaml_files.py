@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from switchmt_snn.config.strict_yaml import parse_yaml, read_text
 from switchmt_snn.errors import ConfigError, did_you_mean
 
 SUFFIXES = (".yaml", ".yml")
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """A key that is written twice is an error; YAML readers keep the last one silently."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.YAMLError(f"the key {key} is written twice")
-        return super().construct_mapping(node, deep)
 
 
 def builtin_files(package: str) -> dict[str, str]:
@@ -35,26 +23,18 @@ def file_text(path: str | Path) -> str:
     """Text of a file.
 
     Raises:
-        ConfigError: it cannot be read, or is not UTF-8.
+        ConfigError: it cannot be read, is too large, or is not UTF-8.
     """
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ConfigError(f"target {path} cannot be read ({reason}), expected a YAML file") from error
+    return read_text(path, "an energy target or a chip")
 
 
 def parse(text: str, where: str) -> dict[str, Any]:
     """The keys and values of a YAML text.
 
     Raises:
-        ConfigError: it is not YAML, has a key twice, or holds no keys.
+        ConfigError: it is not YAML (see ``switchmt_snn.config.strict_yaml``), has a key twice, or holds no keys.
     """
-    try:
-        raw = _UniqueKeys(text).get_single_data()
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{where} is not YAML ({reason}), expected an energy target or a chip") from error
+    raw = parse_yaml(text, where, "an energy target or a chip")
     if not isinstance(raw, dict):
         raise ConfigError(f"{where}: the file is {raw!r:.60}, expected keys and values")
     return raw
@@ -139,7 +119,7 @@ class Section:
             raise self.wrong(key, f"a list of texts{'' if empty else ' with at least one'}")
         for item in items:
             if allowed is not None and item not in allowed:
-                raise ConfigError(f"{self.where}: {self.name(key)} has {item!r}{did_you_mean(item, allowed)}")
+                raise ConfigError(f"{self.where}: {self.name(key)} has {item!r:.80}{did_you_mean(item[:80], allowed)}")
         return tuple(items)
 
     def number(self, key: str) -> float:

@@ -84,8 +84,8 @@ def _neurons(file: Section) -> tuple[str, ...]:
     for kind in kinds:
         if kind not in NEURONS and not is_plugin(kind):
             raise ConfigError(
-                f"{file.where}: neurons has {kind!r}, expected {', '.join(NEURONS)}, or a neuron of your own as "
-                f"module:Class{nearest(kind, NEURONS)}"
+                f"{file.where}: neurons has {kind!r:.80}, expected {', '.join(NEURONS)}, or a neuron of your own as "
+                f"module:Class{nearest(kind[:80], NEURONS)}"
             )
     return kinds
 

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from switchmt_snn.tasks.report import EnvironmentReport
 
 
+MOST_STEPS = 10_000_000
+
+
 @dataclass(frozen=True)
 class CheckEnvOptions:
     """What environments are taken for, how they play, and why training would refuse them."""
@@ -35,8 +38,8 @@ def command(argv: list[str]) -> int:
     options = parse(CheckEnvOptions, rest, "check-env", CheckEnvOptions())
     if not names:
         raise ConfigError("check-env was given no environment, expected one: switchmt-snn check-env CartPole-v1")
-    if options.steps < 1:
-        raise ConfigError(f"--steps is {options.steps}, expected at least 1")
+    if not 1 <= options.steps <= MOST_STEPS:
+        raise ConfigError(f"--steps is {options.steps}, expected 1 to {MOST_STEPS:,}")
     from switchmt_snn.tasks.report import check_env
 
     reports = check_env(

@@ -12,6 +12,7 @@ import types
 import typing
 from typing import Any, Literal, Union, cast, get_args, get_origin
 
+from switchmt_snn.config.bounds import LONGEST_LIST, LONGEST_TEXT, largest
 from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.config.plugins import PluginName, is_plugin
 from switchmt_snn.errors import ConfigError, nearest
@@ -26,21 +27,21 @@ def require(holds: bool, key: str, seen: object, expected: str, remedy: str = ""
         ConfigError: the condition does not hold; names the key, the value seen, and what was expected.
     """
     if not holds:
-        raise ConfigError(f"{key} is {seen!r}, expected {expected}{'; ' + remedy if remedy else ''}")
+        raise ConfigError(f"{key} is {seen!r:.120}, expected {expected}{'; ' + remedy if remedy else ''}")
 
 
 def check_fields(config: Any, section: str = "") -> None:
     """Check every field of a config against its annotation, and store the values in their annotated types.
 
     A whole float becomes an int (``64.0``), an int or a number as text (YAML reads ``1e-4`` as text) a float, a list a
-    tuple. A bool is no number.
+    tuple. A bool is no number. Sizes have the bounds of ``switchmt_snn.config.bounds``.
 
     Args:
         config: a frozen dataclass, as it is made.
         section: its name in the experiment's config; empty for the experiment itself.
 
     Raises:
-        ConfigError: an unknown choice or a value of another type; names the key.
+        ConfigError: an unknown choice, a value of another type or size; names the key.
     """
     for name, annotation in field_types(type(config)).items():
         key = f"{section}.{name}" if section else name
@@ -87,6 +88,7 @@ def _checked(annotation: Any, value: Any, key: str) -> Any:
         return value
     if get_origin(kind) is tuple:
         require(isinstance(value, (list, tuple)), key, value, "a list")
+        require(len(value) <= LONGEST_LIST, key, value, f"at most {LONGEST_LIST} entries")
         return tuple(_scalar(get_args(kind)[0], item, key) for item in value)
     return _scalar(kind, value, key)
 
@@ -95,23 +97,32 @@ def _choice(names: tuple[str, ...], plugins: bool, value: Any, key: str) -> str:
     if isinstance(value, str) and (value in names or (plugins and is_plugin(value))):
         return str(value)
     expected = f"one of {', '.join(names)}{', or a class as package.module:Name' if plugins else ''}"
-    raise ConfigError(f"{key} is {value!r}, expected {expected}{nearest(str(value), names)}")
+    raise ConfigError(f"{key} is {value!r:.120}, expected {expected}{nearest(str(value)[:LONGEST_TEXT], names)}")
 
 
 def _scalar(kind: type[Any], value: Any, key: str) -> Any:
     number = value
-    if kind is float and isinstance(value, str):
+    if isinstance(value, str) and kind in (int, float) and len(value) <= LONGEST_TEXT:
         # YAML 1.1 reads 1e-4 (no dot) as text; a researcher means a number.
         with contextlib.suppress(ValueError):
-            number = float(value)
-    if kind is int and isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            number = whole_number(value)
-    is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
-    if kind is float and is_number and math.isfinite(number):
-        return float(number)
-    if kind is int and is_number and math.isfinite(number) and float(number).is_integer():
-        return int(number)
+            number = float(value) if kind is float else whole_number(value)
+    if isinstance(number, (int, float)) and not isinstance(number, bool) and kind in (int, float):
+        return _number(kind, number, value, key)
     if kind in (bool, str) and isinstance(value, kind):
+        require(kind is bool or len(value) <= LONGEST_TEXT, key, value, f"at most {LONGEST_TEXT} characters")
         return kind(value)
-    raise ConfigError(f"{key} is {value!r}, expected {_KINDS[kind]}")
+    raise _of_another_kind(kind, value, key)
+
+
+def _number(kind: type[Any], number: int | float, value: Any, key: str) -> int | float:
+    """A number in its annotated type, within its bounds; ``value`` is as it was written."""
+    bound = largest(key, kind)
+    finite = isinstance(number, int) or math.isfinite(number)  # a whole number may be larger than any float
+    if not finite or (kind is int and number != int(number)):
+        raise _of_another_kind(kind, value, key)
+    require(-bound <= number <= bound, key, value, f"at most {bound:,}" if kind is int else f"at most {bound:g}")
+    return int(number) if kind is int else float(number)
+
+
+def _of_another_kind(kind: type[Any], value: Any, key: str) -> ConfigError:
+    return ConfigError(f"{key} is {value!r:.120}, expected {_KINDS[kind]}")

@@ -13,8 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NewType
 
-import yaml
-
+from switchmt_snn.config.strict_yaml import parse_yaml
 from switchmt_snn.errors import ConfigError
 
 PluginName = NewType("PluginName", str)
@@ -66,6 +65,8 @@ def import_plugin_module(module_name: str) -> ModuleType:
     """
     if module_name == _script_name():
         return _script()
+    if module_name.endswith(".__main__"):
+        raise ImportError(f"{module_name} is a program, not a module")
     folder = str(Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)
@@ -73,7 +74,7 @@ def import_plugin_module(module_name: str) -> ModuleType:
         return importlib.import_module(module_name)
     except ImportError:
         raise
-    except Exception as error:  # whatever the module's own code raises
+    except (Exception, SystemExit) as error:  # whatever the module's own code raises
         raise ImportError(failure(error)) from error
 
 
@@ -141,8 +142,8 @@ def plugin_options(options: Sequence[str], key: str) -> dict[str, bool | int | f
 def _plain(text: str) -> bool | int | float | str | None:
     """A number, a truth value or text; None for anything else."""
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
+        value = parse_yaml(text, "an option", "a plain value")
+    except ConfigError:
         return None
     if isinstance(value, str):
         with contextlib.suppress(ValueError):  # YAML 1.1 reads 1e-4 (no dot) as text

@@ -13,6 +13,7 @@ import yaml
 from switchmt_snn.config.checks import field_types
 from switchmt_snn.config.decided import KEY, closed, opened, presumably_open, record
 from switchmt_snn.config.experiment import ExperimentConfig
+from switchmt_snn.config.strict_yaml import parse_yaml, printable, read_text
 from switchmt_snn.errors import ConfigError, did_you_mean
 
 
@@ -36,22 +37,21 @@ def load_config(
         (('breakout', 'asterix', 'space_invaders'), 600000)
     """
     path = Path(source)
-    text = path.read_text(encoding="utf-8") if path.is_file() else _preset_text(path, str(source))
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(
-            f"{source} is not YAML ({' '.join(str(error).split())}); see docs/configuration.md"
-        ) from error
+    where = printable(source)
+    preset = _preset_text(path)
+    if preset is None and not _exists(path):
+        raise ConfigError(f"no config file or preset {where!r}{did_you_mean(path.stem, _preset_texts())}")
+    text = read_text(path, "a config") if preset is None else preset
+    data = parse_yaml(text, where, "a config (docs/configuration.md)")
     if data is None:
         data = {}
     if not isinstance(data, dict):
-        return from_dict(data, where=str(source))
-    settings = opened(data, str(source)) if reopen else closed(data)
+        return from_dict(data, where=where)
+    settings = opened(data, where) if reopen else closed(data)
     for section, values in (absent or {}).items():
         if isinstance(settings.get(section, {}), dict):
             settings[section] = values | settings.get(section, {})
-    config = from_dict(settings, where=str(source))
+    config = from_dict(settings, where=where)
     is_older_run = path.name == "config.yaml" and path.with_name("environment.json").is_file() and KEY not in data
     return presumably_open(config) if reopen and is_older_run else config
 
@@ -69,12 +69,18 @@ def _preset_texts() -> dict[str, str]:
     return {entry.name.removesuffix(".yaml"): entry.read_text(encoding="utf-8") for entry in files}
 
 
-def _preset_text(path: Path, shown: str) -> str:
-    texts = _preset_texts()
+def _preset_text(path: Path) -> str | None:
+    """The text of the preset that a path names; None if it names none, or a file that is there."""
     is_name = path.suffix in ("", ".yaml") and (len(path.parts) == 1 or path.parts[:-1] == ("configs",))
-    if is_name and path.stem in texts:
-        return texts[path.stem]
-    raise ConfigError(f"no config file or preset {shown!r}{did_you_mean(path.stem, texts)}")
+    return _preset_texts().get(path.stem) if is_name and not (_exists(path) and path.is_file()) else None
+
+
+def _exists(path: Path) -> bool:
+    """Whether something is there; False for a path that no file system takes."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def from_dict(data: object, where: str = "config") -> ExperimentConfig:
@@ -126,12 +132,14 @@ def _flatten(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def _build(cls: type[Any], data: object, where: str, prefix: str) -> Any:
     if not isinstance(data, dict):
-        raise ConfigError(f"{where}: {prefix.rstrip('.') or 'the file'} is {data!r}, expected a mapping of settings")
+        raise ConfigError(
+            f"{where}: {prefix.rstrip('.') or 'the file'} is {data!r:.80}, expected a mapping of settings"
+        )
     fields = field_types(cls)
     values: dict[str, Any] = {}
     for key, value in data.items():
         if key not in fields:
-            raise ConfigError(f"{where}: unknown key {prefix}{key}{did_you_mean(str(key), fields)}")
+            raise ConfigError(f"{where}: unknown key {prefix}{printable(key)}{did_you_mean(str(key), fields)}")
         nested = dataclasses.is_dataclass(fields[key])
         values[key] = _build(fields[key], value, where, f"{prefix}{key}.") if nested else value
     try:

@@ -44,6 +44,9 @@ CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
 }
 """(output channels, kernel, stride) of each trunk's convolutions."""
 
+MOST_WEIGHTS = 2**25
+"""Most weights of a layer (128 MiB): a size that is meant is far below (the paper's largest layer has 1.6 million)."""
+
 State = dict[str, NeuronState]
 """State variables of each layer's neurons (``NeuronLayer.STATE``) by layer name; an empty dict is the resting state."""
 
@@ -184,9 +187,32 @@ class QNetwork(nn.Module):
         outputs = (
             {"value": 1, "advantage": observation.num_actions} if traits.dueling else {"q": observation.num_actions}
         )
+        self._require_size(features, config.quantiles * observation.num_actions)
         self.streams = nn.ModuleDict(
             {name: Stream(config, features, n, observation.num_tasks, self.spiking) for name, n in outputs.items()}
         )
+
+    def _require_size(self, inputs: int, outputs: int) -> None:
+        """Refuse layers that would fill the memory before anything can say so.
+
+        Args:
+            inputs: of a stream, or of the mlp trunk.
+            outputs: of a stream's head for one task.
+        """
+        config, tasks = self.config, self.observation.num_tasks
+        hidden = cast(int, config.hidden_units)
+        per_neuron = hidden if config.dendrites == "per_neuron" else 1
+        sizes = {
+            "hidden_units": hidden * inputs,
+            "quantiles": hidden * outputs * (tasks if config.heads == "per_task" else 1),
+            "dendritic_segments": config.dendritic_segments * tasks * per_neuron,
+        }
+        for name, weights in sizes.items():
+            if weights > MOST_WEIGHTS:
+                raise ConfigError(
+                    f"network.{name} is {getattr(config, name)}, which makes a layer of {weights:,} weights, expected "
+                    f"at most {MOST_WEIGHTS:,}; lower it"
+                )
 
     def _build_trunk(self) -> tuple[int, ...]:
         """Append the trunk's layers and return the shape of the last one's output."""
@@ -197,6 +223,7 @@ class QNetwork(nn.Module):
         shape: tuple[int, ...] = (channels, *observation.shape[1:])
         if config.trunk == "mlp":
             hidden = cast(int, config.hidden_units)
+            self._require_size(math.prod(shape), 1)
             # An image is flattened, so that the trunk takes any observation.
             synapses = nn.Sequential(nn.Flatten(1), nn.Linear(math.prod(shape), hidden))
             normalization = make_mlp_normalization(config, hidden, observation.num_tasks)

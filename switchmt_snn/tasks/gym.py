@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 
 import gymnasium
@@ -14,7 +13,7 @@ from switchmt_snn.config.plugins import import_plugin_module, is_plugin
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.gym_copies import GymCopies, first_action, is_outside
-from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.gym_make import make_environment, parse_id
 from switchmt_snn.tasks.gym_spaces import FrameLayout, frame_layout, num_actions
 from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
 
@@ -37,9 +36,11 @@ class GymSuite(Suite):
     @property
     def files(self) -> dict[str, Path]:
         """The modules that tasks and wrappers name before a colon."""
-        wrappers = [name for name in self.config.wrappers if is_plugin(name)]
-        modules = dict.fromkeys(name.split(":")[0] for name in (*self.config.names, *wrappers) if ":" in name)
-        return {module: Path(inspect.getfile(import_plugin_module(module))) for module in modules}
+        modules = [parse_id(name)[0] for name in self.config.names]
+        modules += [name.partition(":")[0] for name in self.config.wrappers if is_plugin(name)]
+        named = [module for module in dict.fromkeys(modules) if module is not None]
+        files = {module: getattr(import_plugin_module(module), "__file__", None) for module in named}
+        return {module: Path(file) for module, file in files.items() if file is not None}  # a built-in one has none
 
     def make(self) -> TaskSuite:
         """Make the environments.

@@ -14,8 +14,10 @@ from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
 from switchmt_snn.errors import TaskError, did_you_mean, nearest
 from switchmt_snn.tasks.gym_copies import Env
 
-_FORM = re.compile(r"([\w.]+:)?([\w-]+/)?[\w.-]+")
-"""Of an id: the module that registers it, Gymnasium's namespace, the name."""
+_FORM = re.compile(r"(?:(?P<module>[^\W\d]\w*(?:\.[^\W\d]\w*)*):)?(?P<id>(?:[\w-]+/)?\w[\w.-]*)")
+"""Of a task id: the module that registers it, then Gymnasium's namespace and name."""
+LONGEST_ID = 120
+"""Characters of a task id; the longest of Gymnasium have 40."""
 MOST_COMBINATIONS = 512
 """Most actions that ``FlattenAction`` makes: a Q-network has an output for each."""
 
@@ -65,6 +67,24 @@ WRAPPERS: dict[str, Callable[[Env], Env]] = {
 assert tuple(WRAPPERS) == BUILT_IN_WRAPPERS
 
 
+def parse_id(name: str) -> tuple[str | None, str]:
+    """A task id of the gym suite as its module and Gymnasium's id.
+
+    Raises:
+        TaskError: another form.
+
+    >>> parse_id("my_module:MyEnv-v0"), parse_id("ALE/Pong-v5")
+    (('my_module', 'MyEnv-v0'), (None, 'ALE/Pong-v5'))
+    """
+    found = _FORM.fullmatch(name)
+    if found is None or len(name) > LONGEST_ID:
+        raise TaskError(
+            f"tasks.names has {name!r:.80}, expected an id such as CartPole-v1, or module:Id, such as "
+            "my_module:MyEnv-v0, which imports my_module first"
+        )
+    return found["module"], found["id"]
+
+
 def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
     """One environment of the gym suite, as training plays it.
 
@@ -80,20 +100,19 @@ def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
         >>> make_environment("Blackjack-v1", ["FlattenObservation"]).observation_space.shape
         (45,)
     """
-    if not _FORM.fullmatch(name):
-        raise TaskError(
-            f"tasks.names has {name!r}, expected an id such as CartPole-v1, or module:Id, such as my_module:MyEnv-v0, "
-            "which imports my_module first"
-        )
-    module, colon, env_id = name.partition(":")
-    if colon:
+    module, env_id = parse_id(name)
+    if module is not None:
         _import(name, module)
     try:
-        env: Env = gymnasium.make(env_id if colon else name)
+        env: Env = gymnasium.make(env_id)
     except gymnasium.error.DependencyNotInstalled as error:
         raise TaskError(f"task {name!r} needs a package that is not installed ({error})") from error
     except ImportError as error:
         raise TaskError(f"task {name!r} cannot be made ({error}), expected all its packages; install them") from error
+    except gymnasium.error.DeprecatedEnv as error:
+        raise TaskError(
+            f"tasks.names has the old Gymnasium id {name!r} ({error}), expected its newest version"
+        ) from error
     except gymnasium.error.UnregisteredEnv as error:
         raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{_hint(name)}") from error
     except Exception as error:  # whatever the environment's own code raises
@@ -141,8 +160,8 @@ def _import(name: str, module: str) -> None:
 
 def _hint(name: str) -> str:
     """Near ids: after ``module:``, of those whose class lies in the module."""
-    module, colon, _ = name.partition(":")
-    if not colon:
+    module, _ = parse_id(name)
+    if module is None:
         return (
             f"; an id that a module registers is named module:Id, such as my_module:{name}"
             f"{nearest(name, gymnasium.registry)}"

@@ -244,7 +244,7 @@ def test_wrong_chips_are_refused_in_one_line(changes: dict[str, Any], message: s
 
 def test_a_key_that_is_written_twice_is_refused() -> None:
     """YAML readers keep the second one: a limit would be lost silently."""
-    with pytest.raises(ConfigError, match="the key neurons is written twice"):
+    with pytest.raises(ConfigError, match=r"the key 'neurons' is written twice"):
         parse("limits:\n  neurons: {has: 1}\n  neurons: {has: 2}\n", "my.yaml")
 
 
