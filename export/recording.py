@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy.typing as npt
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
+from switchmt_snn.export.npz import read_npz
 from switchmt_snn.machine.cores import parts
 from switchmt_snn.runs.files import file_name
 from switchmt_snn.tasks.play import Play, episode_seed
@@ -21,6 +20,8 @@ from switchmt_snn.tasks.suite import TaskSuite
 
 COPIES = 4
 """Copies of a task that are recorded side by side; each gives a contiguous stretch."""
+_KEYS = ("observations", "actions", "epsilon", "seed")
+"""Arrays of a file that are read."""
 PIECE_STEPS = 64
 """Steps of every copy that are held at once where play is not kept."""
 
@@ -95,19 +96,33 @@ def _first(recording: Recording, decisions: int) -> Recording:
 
 
 def _read(path: Path, task: str, suite: TaskSuite) -> Recording:
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            observations, actions = stored["observations"], stored["actions"]
-            recording = Recording(task, observations, actions, float(stored["epsilon"]), int(stored["seed"]))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ExportError(f"recorded play {path} cannot be read ({error}), expected an .npz file; delete it") from error
-    expected = (len(actions), *suite.observation_shape)
-    if observations.shape != expected or observations.dtype != suite.frame_dtype or len(actions) % COPIES:
+    stored = read_npz(path, _KEYS, "recorded play of this run; delete it")
+    for key in _KEYS:
+        if key not in stored:
+            raise ExportError(f"recorded play {path} has no {key}, expected {', '.join(_KEYS)}; delete it")
+    observations, actions = stored["observations"], stored["actions"]
+    whole = actions.ndim == 1 and actions.dtype.kind in "iu"
+    expected = (len(actions) if whole else "N", *suite.observation_shape)
+    if not whole or observations.shape != expected or observations.dtype != suite.frame_dtype or len(actions) % COPIES:
         raise ExportError(
-            f"recorded play {path} has shape {observations.shape} of {observations.dtype} for {len(actions)} actions, "
-            f"expected {expected} of {np.dtype(suite.frame_dtype)}; delete it"
+            f"recorded play {path} has observations of shape {observations.shape} and type {observations.dtype}, and "
+            f"actions of shape {actions.shape} and type {actions.dtype}, expected {expected} of "
+            f"{np.dtype(suite.frame_dtype)} and whole numbers, a multiple of {COPIES}; delete it"
         )
-    return recording
+    valid = np.flatnonzero(suite.valid_actions_KA[suite.index(task)])
+    strange = actions[~np.isin(actions, valid)]
+    if len(strange):
+        raise ExportError(
+            f"recorded play {path} has the action {strange[0]}, expected one of {valid.tolist()}, which {task} has; "
+            "delete it"
+        )
+    epsilon, seed = stored["epsilon"], stored["seed"]
+    if epsilon.shape != () or not 0 <= epsilon <= 1 or seed.shape != () or seed.dtype.kind not in "iu" or seed < 0:
+        raise ExportError(
+            f"recorded play {path} has epsilon {epsilon.tolist()!r:.40} and seed {seed.tolist()!r:.40}, expected a "
+            "probability and a whole number from 0; delete it"
+        )
+    return Recording(task, observations, actions.astype(np.int64), float(epsilon), int(seed))
 
 
 def play(

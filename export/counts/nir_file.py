@@ -9,8 +9,6 @@ Shapes: T simulation steps, N decisions, B batch, ... a node's own shape.
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.counts.network import LayerCounts, TaskCounts, layer_counts
 from switchmt_snn.export.counts.nir_convention import NirConvention, doubts, require_stable, stated
 from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
+from switchmt_snn.export.npz import not_finite, read_npz
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
@@ -299,35 +298,19 @@ def _graph(path: Path) -> nir.NIRGraph:
     for name, node in graph.nodes.items():
         for parameter, values in vars(node).items():
             if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise ExportError(f"{path}: {parameter} of {name} holds {_not_finite(values)}, expected finite numbers")
+                raise ExportError(f"{path}: {parameter} of {name} holds {not_finite(values)}, expected finite numbers")
     return graph
 
 
 def _arrays(path: Path) -> dict[str, Array]:
     """``observations`` or ``inputs``, and ``dt`` if it is there, from an ``.npz``."""
-    stored: dict[str, Array] = {}
-    try:
-        with path.open("rb") as stream:  # NumPy forgets to close an archive that is damaged
-            file = np.load(stream, allow_pickle=False)
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise ValueError("it is a single array")
-            keys = list(file.files)
-            stored.update((key, np.asarray(file[key])) for key in ("observations", "inputs", "dt") if key in keys)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ExportError(
-            f"{path} cannot be read ({reason:.120}), expected an .npz file with 'observations' or 'inputs'"
-        ) from error
+    keys = ("observations", "inputs", "dt")
+    stored = read_npz(path, keys, "an .npz file with 'observations' or 'inputs'")
     if ("observations" in stored) == ("inputs" in stored):
         raise ExportError(
-            f"{path} holds {', '.join(keys) or 'nothing'}, expected either 'observations' (raw, [N, ...]) or 'inputs' "
-            "(encoded, [T, N, ...])"
+            f"{path} holds {' and '.join(stored)}, expected either 'observations' (raw, [N, ...]) "
+            "or 'inputs' (encoded, [T, N, ...])"
         )
-    for key, values in stored.items():
-        if values.dtype.kind not in "buif":
-            raise ExportError(f"{path}: {key} has values of type {values.dtype}, expected numbers")
-        if not np.isfinite(values).all():
-            raise ExportError(f"{path}: {key} holds {_not_finite(values)}, expected finite numbers")
     return stored
 
 
@@ -342,12 +325,6 @@ def _dt(graph: nir.NIRGraph, stored: dict[str, Array]) -> float:
     if np.size(dt) != 1 or not np.all(np.asarray(dt) > 0):
         raise ExportError(f"dt is {np.asarray(dt).tolist()}, expected one number above 0")
     return float(np.ravel(dt)[0])
-
-
-def _not_finite(values: Array) -> str:
-    """The first value that is no number, and where it is."""
-    where = tuple(int(index[0]) for index in np.nonzero(~np.isfinite(values)))
-    return f"{values[where]} at {list(where)}"
 
 
 def _sides(shape: npt.ArrayLike) -> tuple[int, ...]:

@@ -92,6 +92,20 @@ def existing_only(q_BA: Float, valid_A: npt.NDArray[np.bool_]) -> Float:
     return np.where(valid_A, q_BA, np.float32(-np.inf))
 
 
+def require_numbers(q_BA: Float, valid_A: npt.NDArray[np.bool_], file: str, task: str) -> None:
+    """Refuse Q-values ``[B, A]`` of existing actions that are not finite: the largest of them says nothing.
+
+    Raises:
+        ExportError: one is NaN or infinite.
+    """
+    seen = q_BA[:, valid_A]
+    if not np.isfinite(seen).all():
+        raise ExportError(
+            f"the {file} file gives the Q-value {seen[~np.isfinite(seen)][0]} in {task}, expected finite numbers; "
+            "export the run again"
+        )
+
+
 class OnnxAgent:
     """``decision.onnx`` in onnxruntime.
 
@@ -146,8 +160,9 @@ class OnnxAgent:
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
         """Q-values ``[B, A]`` of a task (name or index); -inf where an action does not exist."""
-        tasks_B = np.full(len(observation), self.suite.index(task))
-        values: npt.NDArray[np.float32] = self.decide(observation, tasks_B)["q_values"]
+        index = self.suite.index(task)
+        values: npt.NDArray[np.float32] = self.decide(observation, np.full(len(observation), index))["q_values"]
+        require_numbers(values, self.suite.valid_actions_KA[index], "ONNX", self.suite.names[index])
         return values
 
 
@@ -186,6 +201,7 @@ class NirAgent:
         outputs, _ = self.interpreters[self.suite.names[index]].run(encoded)
         settings = self.config.network
         q_BA = ReadoutNode(settings.readout, settings.readout_beta)(outputs)
+        require_numbers(q_BA, self.suite.valid_actions_KA[index], "NIR", self.suite.names[index])
         return existing_only(q_BA, self.suite.valid_actions_KA[index])
 
 

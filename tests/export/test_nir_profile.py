@@ -313,9 +313,9 @@ def test_bad_observations_are_refused_in_one_line(tmp_path: Path, exported) -> N
     saved(stored, observations=x)
     stored.write_bytes(stored.read_bytes().replace(x.tobytes()[:64], bytes(64)))
     refused(path, stored, "cannot be read .*CRC")
-    refused(path, saved(stored, observations=np.array([{}])), "cannot be read .*allow_pickle=False")
-    refused(path, saved(stored, frames=x), "holds frames, expected either 'observations'")
-    refused(path, saved(stored, observations=x, inputs=x), "holds observations, inputs, expected either")
+    refused(path, saved(stored, observations=np.array([{}])), "cannot be read .*observations.npy holds objects")
+    refused(path, saved(stored, frames=x), "holds 'frames', expected an .npz file with 'observations'")
+    refused(path, saved(stored, observations=x, inputs=x), "holds observations and inputs, expected either")
     refused(path, saved(stored, observations=x.astype(str)), "observations has values of type <U3, expected numbers")
     bad = x.astype(np.float32)
     bad[2, 0, 1, 1] = np.nan
