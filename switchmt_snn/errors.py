@@ -6,7 +6,13 @@ The command line prints the message as one line and exits with ``exit_code``; a 
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable
+
+_LARGEST_SHOWN = 8
+"""Numbers of an array that an error shows one by one."""
+_LONGEST_SHOWN = 160
+"""Characters of a value that an error shows."""
 
 
 class SwitchMTError(Exception):
@@ -52,6 +58,44 @@ class TrainingFailed(SwitchMTError):
     """The run itself failed (a loss that is not finite, a full disk); what was good on disk is kept."""
 
     exit_code = 1
+
+
+def shown(value: object) -> str:
+    """What code from outside gave, for an error: its repr on one line, or type and shape of a larger array.
+
+    >>> import numpy
+    >>> shown(numpy.zeros((2, 84, 84)))
+    'a float64 ndarray of shape (2, 84, 84)'
+    """
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if isinstance(shape, tuple) and dtype is not None and math.prod(shape) > _LARGEST_SHOWN:
+        return f"a {str(dtype).removeprefix('torch.')} {type(value).__name__} of shape {tuple(shape)}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+
+
+def require_saved(state: object, names: Iterable[str], owner: str) -> None:
+    """Refuse a saved state that lacks what its owner reads from it.
+
+    Args:
+        state: from a checkpoint.
+        names: what is read.
+        owner: whose state it is, for the error.
+
+    Raises:
+        CheckpointError: the state is no dict, or a name is not in it.
+    """
+    if not isinstance(state, dict):
+        raise CheckpointError(
+            f"the checkpoint has a {type(state).__name__} as the state of {owner}, expected a dict of what it saved; "
+            "start a new run with --run"
+        )
+    missing = [name for name in names if name not in state]
+    if missing:
+        raise CheckpointError(
+            f"the checkpoint has no {', '.join(missing)} of {owner}, expected what it saves; if its code or its config "
+            "changed, restore it, or start a new run with --run"
+        )
 
 
 def nearest(seen: str, known: Iterable[str]) -> str:

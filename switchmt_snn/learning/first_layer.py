@@ -8,13 +8,13 @@ depend on weights at all (results/recipe, First layer).
 
 from __future__ import annotations
 
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
 
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.learning.state import Stateful
+from switchmt_snn.learning.state import Stateful, tensors_like
 from switchmt_snn.spiking.network import QNetwork, TrunkLayer
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
@@ -47,6 +47,16 @@ class FirstLayerMeans(Stateful):
         device = next(network.parameters()).device
         self.inputs = [torch.zeros(shape, device=device) for _ in range(tasks)]
         self.batches = [0] * tasks
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put a saved state back, on the network's device.
+
+        Raises:
+            CheckpointError: it is not whole, or of other tasks or observations.
+        """
+        inputs = self.inputs
+        super().load_state_dict(state)
+        self.inputs = tensors_like(inputs, self.inputs, f"inputs of {type(self).__name__}")
 
     @torch.no_grad()
     def follow(self, observations: Tensor, task: int) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from switchmt_snn.config import LearningConfig
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.errors import ConfigError, require_saved
 from switchmt_snn.learning.clocks import linear_decay
 from switchmt_snn.learning.first_layer import FirstLayerMeans
 from switchmt_snn.learning.state import Stateful
@@ -249,8 +249,15 @@ class Learner(Stateful):
         return {**super().state_dict(), **part}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put a saved state back; JSON made the optimizer's parameter numbers text."""
+        """Put a saved state back; JSON made the optimizer's parameter numbers text.
+
+        Raises:
+            CheckpointError: it is not whole, or of another network, optimizer or ``learning.first_layer_mean``.
+        """
+        first_layer = () if self.first_layer is None else ("first_layer",)
+        require_saved(state, (*self.SAVED, *first_layer), type(self).__name__)
         optimizer = state["optimizer"]
+        require_saved(optimizer, ("state", "param_groups"), f"the optimizer of {type(self).__name__}")
         numbered = {int(number): values for number, values in optimizer["state"].items()}
         state = {**state, "optimizer": {**optimizer, "state": numbered}}
         super().load_state_dict(state)

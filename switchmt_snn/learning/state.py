@@ -6,12 +6,14 @@ A stateful part names what it saves in ``SAVED`` and what it can rebuild (settin
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from switchmt_snn.errors import CheckpointError, ConfigError
+from switchmt_snn.errors import CheckpointError, ConfigError, require_saved
 
 
 class Stateful:
@@ -32,16 +34,12 @@ class Stateful:
         """Put a saved state back; parts and generators are filled in place.
 
         Raises:
-            CheckpointError: an attribute was not saved.
+            CheckpointError: an attribute was not saved, or what was saved does not fit it.
         """
-        missing = [name for name in self.SAVED if name not in state]
-        if missing:
-            raise CheckpointError(
-                f"the checkpoint has no {', '.join(missing)} of {type(self).__name__}, expected what its SAVED names; "
-                "if its code changed, restore it, or start a new run with --run"
-            )
+        owner = type(self).__name__
+        require_saved(state, self.SAVED, owner)
         for name in self.SAVED:
-            setattr(self, name, _unpacked(getattr(self, name), state[name]))
+            setattr(self, name, _unpacked(getattr(self, name), state[name], f"{name} of {owner}"))
 
 
 def require_storable(value: Any, name: str) -> None:
@@ -83,20 +81,75 @@ def _packed(value: Any) -> Any:
     return value.copy() if isinstance(value, (list, dict, np.ndarray)) else value
 
 
-def _unpacked(current: Any, saved: Any) -> Any:
+def _unpacked(current: Any, saved: Any, name: str) -> Any:
     if isinstance(current, np.random.Generator):
-        current.bit_generator.state = saved
+        with _fitting(name, "the state of such a random generator"):
+            current.bit_generator.state = saved
         return current
     if isinstance(current, torch.Generator):
-        current.set_state(saved)
+        with _fitting(name, "the state of such a random generator"):
+            current.set_state(saved)
+        return current
+    if isinstance(current, torch.optim.Optimizer):
+        with _fitting(name, "the state of an optimizer of the same parameters"):
+            current.load_state_dict(saved)
         return current
     if hasattr(current, "load_state_dict"):
         current.load_state_dict(saved)
         return current
     if isinstance(current, torch.Tensor):  # stays on its device
-        return current.copy_(saved)
+        return current.copy_(_tensor_like(current, saved, name))
     if isinstance(current, list) and current and hasattr(current[0], "load_state_dict"):
+        require_saved(saved, map(str, range(len(current))), name)
         for index, item in enumerate(current):
             item.load_state_dict(saved[str(index)])
         return current
     return saved
+
+
+def tensors_like(current: list[torch.Tensor], saved: Any, name: str) -> list[torch.Tensor]:
+    """Saved tensors on the devices of the present ones.
+
+    Args:
+        current: the present tensors.
+        saved: from a checkpoint.
+        name: what they are, for the error.
+
+    Raises:
+        CheckpointError: not as many tensors, or one of another shape.
+    """
+    if not isinstance(saved, list) or len(saved) != len(current):
+        raise _unfitting(name, _kind(saved), f"a list of {len(current)} tensors")
+    return [
+        _tensor_like(now, tensor, f"number {index} of {name}").to(now.device)
+        for index, (now, tensor) in enumerate(zip(current, saved, strict=True))
+    ]
+
+
+def _tensor_like(current: torch.Tensor, saved: Any, name: str) -> torch.Tensor:
+    if not isinstance(saved, torch.Tensor) or saved.shape != current.shape:
+        raise _unfitting(name, _kind(saved), _kind(current))
+    return saved
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, (torch.Tensor, np.ndarray)):
+        return f"a {type(value).__name__} of shape {tuple(value.shape)}"
+    return f"a list of {len(value)}" if isinstance(value, list) else f"a {type(value).__name__}"
+
+
+def _unfitting(name: str, seen: str, expected: str) -> CheckpointError:
+    return CheckpointError(
+        f"the checkpoint has {seen} as {name}, expected {expected}; if code or config changed, restore it, or start a "
+        "new run with --run"
+    )
+
+
+@contextmanager
+def _fitting(name: str, expected: str) -> Iterator[None]:
+    """Around PyTorch's and NumPy's own loading: what they raise about a state that does not fit becomes one line."""
+    try:
+        yield
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise _unfitting(name, f"a state that does not fit ({reason:.300})", expected) from error

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from switchmt_snn.config import ExperimentConfig, clips_rewards
-from switchmt_snn.errors import TrainingFailed
+from switchmt_snn.errors import TrainingFailed, require_saved
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.learner import Learner
@@ -350,7 +350,12 @@ class Training(Stateful):
         return {**super().state_dict(), "plays": plays}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue a run; ``reproducible`` says whether its episodes repeated themselves from seed and actions."""
+        """Continue a run; ``reproducible`` says whether its episodes repeated themselves from seed and actions.
+
+        Raises:
+            CheckpointError: the state is not whole, or of another run.
+        """
+        require_saved(state, ("plays",), type(self).__name__)
         older = {"return_scales": [], "updates_in_visit": 0}  # what states of older versions lack, and do not use
         super().load_state_dict({**older, **state})
         replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]

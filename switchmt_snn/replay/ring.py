@@ -22,6 +22,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from switchmt_snn.errors import CheckpointError, require_saved
 from switchmt_snn.replay.frames import CompressedFrames, FrameStore, PlainFrames
 from switchmt_snn.replay.on_device import DeviceFrames
 
@@ -283,7 +284,12 @@ class FrameReplay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put everything but the frames back; ``load_segment`` brings the frames."""
+        """Put everything but the frames back; ``load_segment`` brings the frames.
+
+        Raises:
+            CheckpointError: the state is not whole, or of another size; nothing is changed.
+        """
+        self._require_fits(state)
         self._written[:] = state["written"]
         self._oldest[:] = state["oldest"]
         self.transitions_added = int(state["transitions_added"])
@@ -292,6 +298,19 @@ class FrameReplay:
             for part in self._by_lane(array):
                 part[:] = state[name][offset : offset + len(part)]
                 offset += len(part)
+
+    def _require_fits(self, state: dict[str, Any]) -> None:
+        owner, arrays = type(self).__name__, self._arrays()
+        require_saved(state, ("written", "oldest", "transitions_added", *arrays), owner)
+        lanes = np.shape(self._written)
+        held = np.minimum(state["written"], self.slots).sum() if np.shape(state["written"]) == lanes else -1
+        expected = {"written": lanes, "oldest": lanes, **dict.fromkeys(arrays, (held,))}
+        for name, shape in expected.items():
+            if np.shape(state[name]) != shape:
+                raise CheckpointError(
+                    f"the checkpoint has {name} of shape {np.shape(state[name])} of {owner}, expected {shape}; set "
+                    "tasks.num_envs and learning.replay_capacity_steps as they were, or start a new run with --run"
+                )
 
     def _arrays(self) -> dict[str, npt.NDArray[Any]]:
         return {

@@ -24,7 +24,7 @@ import safetensors.torch
 import torch
 import zstandard
 
-from switchmt_snn.errors import CheckpointError
+from switchmt_snn.errors import CheckpointError, require_saved
 from switchmt_snn.replay.ring import FrameReplay, Segment
 from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
 
@@ -225,6 +225,8 @@ class CheckpointStore:
         tree = _read_json(_read_file(path, "state.json", manifest), "state.json")
         state = _join(tree, model, training)
         contents = [self._read_segment(entry) for entry in manifest["segments"]]
+        require_saved(state, ("replays",), "the run")
+        require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
         # Nothing is changed before everything was read.
         for task, replay in enumerate(replays):
             replay.load_state_dict(state["replays"][str(task)])

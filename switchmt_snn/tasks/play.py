@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from switchmt_snn.errors import CheckpointError, require_saved
 from switchmt_snn.tasks.contract import CheckedEnvironment
 from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
 
@@ -90,7 +91,23 @@ class Play:
         Returns:
             Whether the environments led to the same observations and returns. False means that the environment is
             not reproducible from its seed; its episodes are then wherever the actions led.
+
+        Raises:
+            CheckpointError: the state is not whole, or of another number of copies.
         """
+        require_saved(state, ("task", "seeds", "actions", "fingerprint"), type(self).__name__)
+        stored = len(state["seeds"]), len(state["actions"])
+        if state["task"] != self.task:
+            raise CheckpointError(
+                f"the checkpoint has episodes of task {state['task']!r}, expected some of task {self.task}; start "
+                "a new run with --run"
+            )
+        if stored != (self.num_envs, self.num_envs):
+            raise CheckpointError(
+                f"the checkpoint has {stored[0]} seeds and {stored[1]} lists of actions of a task, expected "
+                f"{self.num_envs} of each for tasks.num_envs={self.num_envs}; set it as it was, or start a new run "
+                "with --run"
+            )
         journals = [np.asarray(actions, np.int64) for actions in state["actions"]]
         seeds = np.asarray(state["seeds"], np.int64)
         longest = max(len(journal) for journal in journals)

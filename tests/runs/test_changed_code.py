@@ -122,7 +122,7 @@ def test_a_state_that_the_checkpoint_does_not_have_is_one_line(folder: Path) -> 
         "        self.window = window\n",
         "        self.window = window\n        self.best = 0\n",
     )
-    with pytest.raises(CheckpointError, match="has no best of ReturnAbove, expected what its SAVED names"):
+    with pytest.raises(CheckpointError, match="has no best of ReturnAbove, expected what it saves"):
         continued(folder, 80)
 
 

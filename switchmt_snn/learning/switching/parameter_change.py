@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
+from switchmt_snn.errors import require_saved
 from switchmt_snn.learning.switching.criterion import Criterion, EpisodeRecord, Verdict, register_criterion
 
 
@@ -58,6 +59,7 @@ class ParameterChange(Criterion):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Put a saved state back; states of runs that began before updates were kept have none, nor use any."""
+        require_saved(state, ("history",), type(self).__name__)
         super().load_state_dict({"updates": [0] * len(state["history"]), **state})
 
 
