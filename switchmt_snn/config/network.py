@@ -12,6 +12,9 @@ from switchmt_snn.config.plugins import PluginName
 EncodingName = Literal["direct", "rate", "latency", "frames", "events"]
 ENCODING_NAMES: tuple[str, ...] = get_args(EncodingName)
 
+SURROGATES_WITHOUT_SLOPE = ("straight_through_estimator", "SSO", "heaviside")
+"""Values of ``network.surrogate`` whose gradient has no parameter."""
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -72,7 +75,8 @@ class NetworkConfig:
     ] = "atan"
     """Surrogate gradient: a function of snntorch.surrogate (its LSO cannot be called in snnTorch 1.0.0)."""
     surrogate_slope: float | None = None
-    """Slope (alpha) of the surrogate; null takes snnTorch's default."""
+    """Slope (alpha) of the surrogate; null takes snnTorch's default. straight_through_estimator, SSO and heaviside have
+    none."""
     dendrites: Literal["auto", "none", "shared", "per_neuron"] = "auto"
     """Segments shared by a stream (the paper's 18 weights), or own ones per neuron; auto follows the method."""
     dendritic_segments: int = 3
@@ -118,6 +122,12 @@ class NetworkConfig:
         require(self.threshold > 0.0, "network.threshold", self.threshold, "above 0")
         slope = self.surrogate_slope
         require(slope is None or slope > 0.0, "network.surrogate_slope", slope, "above 0, or null")
+        require(
+            slope is None or self.surrogate not in SURROGATES_WITHOUT_SLOPE,
+            "network.surrogate_slope",
+            slope,
+            f"null with network.surrogate={self.surrogate}, which has no slope",
+        )
         current = self.stream_current_thresholds
         require(current > 0.0, "network.stream_current_thresholds", current, "above 0")
         require(0.0 < self.event_threshold < 1.0, "network.event_threshold", self.event_threshold, "within (0, 1)")

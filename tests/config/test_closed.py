@@ -12,6 +12,7 @@ import pytest
 from switchmt_snn.cli import main
 from switchmt_snn.config import ExperimentConfig, LearningConfig, NetworkConfig, SwitchingConfig, from_dict, resolve
 from switchmt_snn.config.checks import accepts_plugins, choices, field_types
+from switchmt_snn.config.network import SURROGATES_WITHOUT_SLOPE
 from switchmt_snn.errors import ConfigError
 
 SECTIONS: dict[str, Any] = {
@@ -71,6 +72,7 @@ def test_an_unknown_choice_is_refused_from_python_yaml_and_flag(section: str, na
 
 @pytest.mark.parametrize(("section", "name", "names"), CHOICES, ids=IDS)
 def test_every_choice_makes_a_config(section: str, name: str, names: tuple[str]) -> None:
+    assert names
     for value in names:
         data: dict[str, Any] = {key: dict(rest) for key, rest in NEEDED.get((name, value), {}).items()}
         (data.setdefault(section, {}) if section else data)[name] = value
@@ -104,6 +106,13 @@ def test_a_learning_config_made_in_python_is_checked(change: dict[str, Any], mes
         ({"surrogate_slope": "steep"}, "network.surrogate_slope is 'steep', expected a finite number"),
         ({"surrogate_slope": -5.0}, "network.surrogate_slope is -5.0, expected above 0, or null"),
         ({"surrogate_slope": 0.0}, "network.surrogate_slope is 0.0, expected above 0, or null"),
+        *(
+            (
+                {"surrogate": name, "surrogate_slope": 2.0},
+                f"network.surrogate_slope is 2.0, expected null with network.surrogate={name}, which has no slope",
+            )
+            for name in SURROGATES_WITHOUT_SLOPE
+        ),
     ],
 )
 def test_a_network_config_made_in_python_is_checked(change: dict[str, Any], message: str) -> None:
@@ -145,7 +154,10 @@ def test_names_of_classes_are_accepted_where_a_field_says_so(name: str) -> None:
 
 def test_every_field_is_checked() -> None:
     """A value that no field can hold is refused by all of them."""
+    refused = set()
     for config in SECTIONS.values():
         for field in fields(config):
             with pytest.raises(ConfigError, match=field.name):
                 config(**{field.name: object()})
+            refused.add(field.name)
+    assert {"seed", "neuron", "batch_size", "policy", "episodes", "names", "tensorboard"} <= refused

@@ -12,6 +12,7 @@ import torch
 from snntorch import surrogate as snntorch_surrogate
 from torch import Tensor
 
+from switchmt_snn.config.checks import require
 from switchmt_snn.spiking.settings import require_known
 
 Surrogate = Callable[[Tensor], Tensor]
@@ -34,20 +35,23 @@ SURROGATES: dict[str, str | None] = {
     "SSO": None,
     "heaviside": None,
 }
-"""Functions of ``snntorch.surrogate``, and the argument of each that ``network.surrogate_slope`` sets."""
+"""Functions of ``snntorch.surrogate``, and the argument of each that ``network.surrogate_slope`` sets; None: it has
+none."""
 
 
 def make_surrogate(name: str, slope: float | None = None) -> Surrogate:
-    """``snntorch.surrogate.<name>``, with its slope argument if one is given and the surrogate has one.
+    """``snntorch.surrogate.<name>``, with its slope argument if one is given.
 
     The gradient of snnTorch's sigmoid is exp(-k x) / (1 + exp(-k x))^2, which is inf / inf = NaN in float32 once
     k x < -88 (a membrane 3.6 below the threshold at the default k = 25). Its true value there is 0, and so is ours.
 
     Raises:
-        ConfigError: ``name`` is not in ``SURROGATES``.
+        ConfigError: ``name`` is not in ``SURROGATES``, or a slope is given for one without.
     """
     require_known("surrogate", name, SURROGATES)
     argument = SURROGATES[name]
+    if argument is None:
+        require(slope is None, "network.surrogate_slope", slope, f"null with network.surrogate={name}")
     arguments = {} if slope is None or argument is None else {argument: slope}
     surrogate: Surrogate = getattr(snntorch_surrogate, name)(**arguments)
     if name != "sigmoid":
