@@ -60,10 +60,10 @@ def forward_passes(
             x, x_next = network.encode(x), network.encode(x_next)
             x_choice = x_next
         with torch.no_grad():
-            next_context = _copied(context) if by_batch else context
             target_context = _copied(target_context) if by_batch else target_context
             next_values = target.values(x_next, target_context, precision=precision, training=by_batch)
             if double_q:
+                next_context = _copied(context) if by_batch else context
                 choice_BA = network.decide(x_choice, next_context, precision=precision, training=by_batch)
             else:
                 choice_BA = target.expected(next_values)

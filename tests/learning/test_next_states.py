@@ -11,6 +11,7 @@ import torch
 
 from switchmt_snn.learning.training import Training
 from switchmt_snn.replay.ring import Returns
+from switchmt_snn.updates import passes
 from switchmt_snn.updates.engine import ENGINES
 from tests.conftest import CountingEnvironment, small_config, vector_suite
 from tests.learning.resuming import assert_continues_exactly
@@ -59,6 +60,7 @@ def test_the_target_s_statistics_do_not_move(engine: str) -> None:
     part = played(engine, next_statistics="batch")
     before = {name: value.clone() for name, value in part.learner.target.named_buffers()}
     part.learner.update(part.replays[0].sample(8, np.random.default_rng(0), Returns()), 0)
+    assert any("running_mean" in name for name in before)
     for name, value in part.learner.target.named_buffers():
         assert torch.equal(value, before[name]), name
 
@@ -83,3 +85,17 @@ def test_a_run_with_both_continues_exactly(engine: str) -> None:
     assert_continues_exactly(
         lambda: training(engine, next_statistics="batch", acting_network="target"), at_steps=(61, 155)
     )
+
+
+@pytest.mark.parametrize(("double_q", "copies"), [(True, 2), (False, 1)])
+def test_only_statistics_that_a_pass_moves_are_copied(
+    double_q: bool, copies: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Q's are moved by the choice of the next action, which is Q's in double DQN alone."""
+    copied: list[object] = []
+    ours = passes._copied
+    monkeypatch.setattr(passes, "_copied", lambda context: copied.append(context) or ours(context))
+    part = played("eager", next_statistics="batch", double_q=double_q)
+    copied.clear()
+    part.learner.update(part.replays[0].sample(8, np.random.default_rng(0), Returns()), 0)
+    assert len(copied) == copies

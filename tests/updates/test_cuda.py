@@ -30,6 +30,8 @@ FORMS: list[dict[str, Any]] = [
     {"learning": {"gradient_clip": "value", "double_q": False}},
     {"network": {"encoding": "rate", "neuron": "LIF", "learn_beta": True}},
     {"network": {"method": "DQN_D"}},
+    {"learning": {"next_statistics": "batch"}},
+    {"learning": {"next_statistics": "batch", "double_q": False}},
     {"network": {"quantiles": 4, "heads": "per_task"}, "learning": {"loss": "huber"}},
 ]
 
