@@ -27,7 +27,7 @@ from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, read_nir
 from switchmt_snn.runs.evaluations import evaluation_name
-from switchmt_snn.runs.files import file_name, json_text, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, write_atomically, written_whole
 from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
@@ -221,12 +221,8 @@ def _write_nir(
     for task, graph in graphs.items():
         graph.metadata.update(facts)
         path = folder / f"{file_name(task)}.nir"
-        temporary = path.with_suffix(".tmp.nir")
-        try:
+        with written_whole(path) as temporary:
             write_nir(graph, temporary)
-            temporary.rename(path)
-        finally:
-            temporary.unlink(missing_ok=True)
         beside = metadata(network) | facts | {"task": task, DIALECT_KEY: dialect_of(graph), "dt": graph.metadata["dt"]}
         write_atomically(path.with_suffix(".json"), json_text(beside, indent=1).encode())
         files[path.name] = path

@@ -14,7 +14,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.npz import read_npz
 from switchmt_snn.machine.cores import parts
-from switchmt_snn.runs.files import file_name
+from switchmt_snn.runs.files import file_name, written_whole
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -72,16 +72,15 @@ def recorded_play(
             return _first(recording, decisions)
     recording = play(agent, task, decisions, config.epsilon, config.seed, go_on)
     folder.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(
-        temporary,
-        observations=recording.observations,
-        actions=recording.actions,
-        first_action=np.asarray(agent.suite.first_action(agent.suite.index(task))),
-        epsilon=np.asarray(recording.epsilon),
-        seed=np.asarray(recording.seed),
-    )
-    temporary.rename(path)
+    with written_whole(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            observations=recording.observations,
+            actions=recording.actions,
+            first_action=np.asarray(agent.suite.first_action(agent.suite.index(task))),
+            epsilon=np.asarray(recording.epsilon),
+            seed=np.asarray(recording.seed),
+        )
     return recording
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from switchmt_snn.export import ExportSettings, export, export_run
 from tests.export.export_cases import RunCommand
 
 
@@ -152,3 +154,26 @@ def test_the_same_from_python(trained_run: Path) -> None:
     assert {row["runtime"] for row in result["recorded"]} == {"onnx", "nir"}
     with pytest.raises(ExportError, match="pass observations="):
         check_parity(bare)
+
+
+@pytest.mark.parametrize("written", [(np, "savez_compressed"), (export_run, "write_nir")])
+def test_two_exports_of_one_run_at_once_do_not_meet(
+    trained_run: Path, monkeypatch: pytest.MonkeyPatch, written: tuple[Any, str]
+) -> None:
+    """A whole second export comes between a file of the first and its renaming."""
+    settings = ExportSettings(nir=True, parity_decisions=20)
+    module, name = written
+    write, seconds = getattr(module, name), []
+
+    def write_and_export_again(*arguments: Any, **named: Any) -> None:
+        write(*arguments, **named)
+        if not seconds:
+            seconds.append("begun")
+            seconds.append(export(trained_run, settings).parity["failures"])
+
+    monkeypatch.setattr(module, name, write_and_export_again)
+    first = export(trained_run, settings)
+    assert seconds == ["begun", []]
+    assert first.parity["failures"] == []
+    assert all(path.is_file() for path in first.files.values())
+    assert not [path for path in trained_run.rglob("*") if ".tmp" in path.name]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import re
+from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from switchmt_snn.runs.files import file_name, json_text
+from switchmt_snn.runs.files import file_name, json_text, written_whole
 from switchmt_snn.tasks.registry import SUITES
 
 TASKS = st.one_of(
@@ -37,6 +39,20 @@ def test_names_of_known_tasks_stay_as_they_are() -> None:
     for suite in SUITES.values():
         assert all(file_name(task) == task for task in suite.known_tasks() if not set(task) & set("/:"))
     assert file_name("breakout", "pong") == "breakout+pong"
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
+    """Both write whole files; the one that ends last stays."""
+    path = tmp_path / "file.json"
+    with written_whole(path) as outer, written_whole(path) as inner:
+        assert outer != inner
+        outer.write_text("outer")
+        inner.write_text("inner")
+    assert path.read_text() == "outer"
+    with pytest.raises(UnicodeEncodeError), written_whole(path) as failed:
+        failed.write_text("half \N{SNOWMAN}", "ascii")
+    assert path.read_text() == "outer"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_json_holds_no_number_that_json_does_not_know() -> None:
