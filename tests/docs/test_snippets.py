@@ -27,19 +27,23 @@ def is_run_elsewhere(block: Block) -> bool:
 @pytest.mark.parametrize("page", PAGES)
 def test_every_block_of_a_page_runs(page: str, tmp_path: Path) -> None:
     reader = Reader(tmp_path)
-    for block in blocks(page):
-        if not is_run_elsewhere(block) and block.not_tested is None:
-            reader.follow(block)
+    run = [block for block in blocks(page) if not is_run_elsewhere(block) and block.not_tested is None]
+    assert {block.language for block in run} >= {"bash", "python"}, page
+    for block in run:
+        reader.follow(block)
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_configs_of_a_page_explore_less_before_they_end(page: str) -> None:
-    """A reader copies them: with the default's million steps a short run would play at random."""
+def test_configs_of_a_page_learn_before_they_end(page: str) -> None:
+    """A reader copies them. With the defaults of long runs a short one plays at random, and its target never moves."""
     configs = [block for block in blocks(page) if block.language == "yaml" and "total_steps:" in block.text]
     assert configs or page == "README.md"
     for block in configs:
         config = yaml.safe_load(block.text)
-        assert config["learning"].get("epsilon_decay_steps", 1e6) < config["total_steps"], str(block)
+        learning, steps = config["learning"], config["total_steps"]
+        assert learning.get("epsilon_decay_steps", 1e6) < steps, str(block)
+        learned = steps - learning["learning_starts_steps"] * len(config["tasks"]["names"])
+        assert 4 * learning.get("target_update_every_steps", 10_000) <= learned, str(block)
 
 
 @pytest.mark.parametrize("page", PAGES)
