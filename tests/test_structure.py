@@ -45,6 +45,20 @@ def test_docstrings_have_no_sphinx_roles(path: Path) -> None:
     assert not any(role in path.read_text() for role in roles), f"{path}: write ``name``, no Sphinx role"
 
 
+def test_a_method_that_a_subclass_must_define_says_so() -> None:
+    """``raise NotImplementedError`` alone would be a traceback without a word."""
+    raised = 0
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Raise):
+                continue
+            if isinstance(node.exc, ast.Call) and getattr(node.exc.func, "id", "") == "NotImplementedError":
+                raised += 1
+                assert ", expected " in ast.unparse(node.exc), f"{path}:{node.lineno}"
+            assert getattr(node.exc, "id", "") != "NotImplementedError", f"{path}:{node.lineno}"
+    assert raised >= 5
+
+
 def packages() -> list[str]:
     found = [path.parent.relative_to(ROOT) for path in sources() if path.name == "__init__.py"]
     return [

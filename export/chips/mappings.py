@@ -21,7 +21,10 @@ class Mapping:
     @property
     def num_cores(self) -> int | None:
         """Number of cores; None where they are not counted."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} defines no num_cores, expected a property with the number of cores, or None where "
+            "they are not counted"
+        )
 
     def layer_limits(self, layer: LayerShape, resources: list[Limit]) -> list[Limit]:
         """Limits of one layer: those of the chip's ``resources``, and those of the mapping."""

@@ -72,7 +72,7 @@ class SynapseNode:
     @property
     def kind(self) -> str:
         """The kind of synapses in descriptions and errors (``Conv2d``, ``Linear``)."""
-        raise NotImplementedError(f"{type(self).__name__} has no kind, expected a name")
+        raise NotImplementedError(f"{type(self).__name__} defines no kind, expected a property with a name")
 
     @property
     def depends_on_task(self) -> bool:
@@ -87,7 +87,7 @@ class SynapseNode:
     @property
     def dense_operations(self) -> int:
         """Products of one pass in which every weight meets every input that it reaches; padding is not counted."""
-        raise NotImplementedError(f"{type(self).__name__} does not count its operations, expected a number")
+        raise NotImplementedError(f"{type(self).__name__} defines no count of its operations, expected a number")
 
     def of_task(self, task: int) -> SynapseNode:
         """The synapses of a network that serves one task; other tasks' weights are left out."""
@@ -258,7 +258,7 @@ class NeuronNode:
     @property
     def kind(self) -> str:
         """The model's name in metadata and reports (``IF``, ``LIF``, ``relu``, ...)."""
-        raise NotImplementedError(f"{type(self).__name__} has no kind, expected a name")
+        raise NotImplementedError(f"{type(self).__name__} defines no kind, expected a property with a name")
 
     @property
     def states(self) -> tuple[str, ...]:

@@ -196,7 +196,10 @@ class Suite:
             TaskError: a task cannot be made, or does not fit a Q-network.
             MissingExtraError: an optional package is needed.
         """
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} defines no make, expected make(self) -> TaskSuite; see "
+            "docs/extending.md, Task and suite"
+        )
 
     @classmethod
     def known_tasks(cls) -> tuple[str, ...]:

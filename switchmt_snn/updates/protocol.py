@@ -113,7 +113,7 @@ class Engine(ABC):
 
     def decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
         """Q-values ``[B, A]`` of raw observations ``[B, *shape]`` in eval mode, by which training acts."""
-        raise NotImplementedError(f"the {self.name} engine does not act")
+        raise NotImplementedError(f"the {self.name} engine does not act, expected learning.acting=eager with it")
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Adam over the parameters of ``network``."""

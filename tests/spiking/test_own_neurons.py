@@ -307,7 +307,7 @@ MISTAKES = {
     ShortNode: r"has an array of shape \(2,\) as threshold_O from node\(5\), expected an array of 5 numbers",
     NumberNode: r"has a float as threshold_O from node\(5\), expected an array of 5 numbers",
     NaNNode: r"has threshold_O = \[nan, .*expected finite numbers",
-    NamelessDescription: r"fails in node \(NotImplementedError: NamelessNode has no kind",
+    NamelessDescription: r"fails in node \(NotImplementedError: NamelessNode defines no kind, expected a property",
     CommalessDescription: "has a node whose states are 'membrane', expected a tuple of names",
     WrongRest: "from initial_state, expected a tuple of tensors",
 }
