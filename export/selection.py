@@ -8,8 +8,8 @@ from pathlib import Path
 
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.chips.chip import Chip
-from switchmt_snn.export.chips.chip_file import builtin_chips, read_chip
-from switchmt_snn.export.energy.estimate import Target, builtin_targets, read_target
+from switchmt_snn.export.chips.chip_file import CHIPS
+from switchmt_snn.export.energy.estimate import TARGETS, Target
 from switchmt_snn.export.yaml_files import SUFFIXES, file_text, parse
 
 KINDS = ("energy", "chip")
@@ -31,7 +31,7 @@ class Selection:
             ConfigError: no such target or chip, a file that is neither or takes a built-in one's name, or one name
                 for two.
         """
-        known, chips = builtin_targets(), builtin_chips()
+        known, chips = TARGETS.built_in, CHIPS.built_in
         names = (names,) if isinstance(names, (str, Path)) else names
         if not names:
             return cls(tuple(known.values()), tuple(chips.values()))
@@ -39,7 +39,7 @@ class Selection:
         _require_each_once(list(map(str, names)))
         for name in map(str, names):
             if Path(name).suffix in SUFFIXES:
-                found.append(_own_name(_read(name), name))
+                found.append(_read(name))
             elif name in known or name in chips:
                 found += [built_in[name] for built_in in (known, chips) if name in built_in]
             else:
@@ -60,18 +60,9 @@ def _read(file: str) -> Target | Chip:
     kind = raw.get("kind", "chip" if "limits" in raw else "energy")
     if kind not in KINDS:
         raise ConfigError(f"{file}: kind is {kind!r:.60}, expected one of {', '.join(KINDS)}")
-    return read_chip(raw, file) if kind == "chip" else read_target(raw, file)
-
-
-def _own_name(read: Target | Chip, file: str) -> Target | Chip:
-    """What a file holds, if its name does not stand for other numbers that come with the package."""
-    kind, built_in = ("energy target", builtin_targets()) if isinstance(read, Target) else ("chip", builtin_chips())
-    if built_in.get(read.name, read) != read:
-        raise ConfigError(
-            f"{file}: name is {read.name!r}, which is a built-in {kind} with other numbers, expected a name of its "
-            "own; change the name in your file"
-        )
-    return read
+    if kind == "chip":
+        return CHIPS.own(CHIPS.read(raw, file), file)
+    return TARGETS.own(TARGETS.read(raw, file), file)
 
 
 def _require_each_once(names: list[str]) -> None:

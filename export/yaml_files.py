@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 from switchmt_snn.config.strict_yaml import parse_yaml, read_text
 from switchmt_snn.errors import ConfigError, did_you_mean
@@ -13,10 +14,63 @@ from switchmt_snn.errors import ConfigError, did_you_mean
 SUFFIXES = (".yaml", ".yml")
 
 
-def builtin_files(package: str) -> dict[str, str]:
-    """Texts of the YAML files of a package, by file name, sorted."""
-    files = [entry for entry in resources.files(package).iterdir() if entry.name.endswith(SUFFIXES)]
-    return {entry.name: entry.read_text(encoding="utf-8") for entry in sorted(files, key=lambda entry: entry.name)}
+class Named(Protocol):
+    """What a file of facts describes."""
+
+    @property
+    def name(self) -> str:
+        """Its name in tables and lists, which finds a built-in one."""
+
+
+T = TypeVar("T", bound=Named)
+
+
+class Catalog(Generic[T]):
+    """What one kind of YAML files describes, such as chips: the files of a package, and those of a user.
+
+    Args:
+        kind: in words, as ``energy target``, for errors.
+        package: the package whose files are the built-in ones.
+        read: makes one from what ``parse`` gave and the file's name for errors, or raises ConfigError.
+    """
+
+    def __init__(self, kind: str, package: str, read: Callable[[Any, str], T]) -> None:
+        self.kind, self.read = kind, read
+        self._package = package
+
+    @cached_property
+    def built_in(self) -> dict[str, T]:
+        """Those that come with the package, by name, in the order of their files' names."""
+        files = [entry for entry in resources.files(self._package).iterdir() if entry.name.endswith(SUFFIXES)]
+        ordered = sorted(files, key=lambda entry: entry.name)
+        found = [self.read(parse(entry.read_text(encoding="utf-8"), entry.name), entry.name) for entry in ordered]
+        return {one.name: one for one in found}
+
+    def load(self, name_or_file: str | Path) -> T:
+        """A built-in one by name, or one from a YAML file.
+
+        Raises:
+            ConfigError: no such one, or a file that does not describe one.
+        """
+        name = str(name_or_file)
+        if Path(name).suffix in SUFFIXES:
+            return self.read(parse(file_text(name), name), name)
+        if name not in self.built_in:
+            raise ConfigError(f"unknown {self.kind} {name!r}{did_you_mean(name, self.built_in)}")
+        return self.built_in[name]
+
+    def own(self, described: T, file: str) -> T:
+        """What a user's file describes, if its name does not stand for other numbers that come with the package.
+
+        Raises:
+            ConfigError: it does.
+        """
+        if self.built_in.get(described.name, described) != described:
+            raise ConfigError(
+                f"{file}: name is {described.name!r}, which is a built-in {self.kind} with other numbers, expected a "
+                "name of its own; change the name in your file"
+            )
+        return described
 
 
 def file_text(path: str | Path) -> str:

@@ -10,11 +10,11 @@ import torch
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config, resolve
-from switchmt_snn.export.chips.chip_file import MAPPINGS, builtin_chips
+from switchmt_snn.export.chips.chip_file import CHIPS, MAPPINGS
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.mappings import CorePerLayer
 from switchmt_snn.export.chips.rules import RULES
-from switchmt_snn.export.energy.estimate import Target, builtin_targets
+from switchmt_snn.export.energy.estimate import TARGETS, Target
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
@@ -53,7 +53,7 @@ def _table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 def targets_part() -> str:
     """A row per energy target, and what each includes and leaves out."""
-    targets = builtin_targets().values()
+    targets = TARGETS.built_in.values()
     table = _table(
         ("target", "chip", "evidence", "pJ per operation", "source"),
         (
@@ -75,8 +75,8 @@ def _prices(target: Target) -> str:
 
 def not_priced_part() -> str:
     """The chips of this page that no energy target prices."""
-    priced = {target.chip for target in builtin_targets().values()}
-    titles = [chip.title for chip in builtin_chips().values() if chip.title not in priced]
+    priced = {target.chip for target in TARGETS.built_in.values()}
+    titles = [chip.title for chip in CHIPS.built_in.values() if chip.title not in priced]
     return f"No energy per operation is published for {', '.join(titles)}; none is invented."
 
 
@@ -98,7 +98,7 @@ def chips_part() -> str:
                 f"{chip.widths.weight_bits} bits",
                 chip.source,
             )
-            for chip in builtin_chips().values()
+            for chip in CHIPS.built_in.values()
         ),
     )
 
@@ -110,7 +110,7 @@ def _mapping_name(mapping: object) -> str:
 def limits_part() -> str:
     """A row per limit of every chip."""
     rows = []
-    for chip in builtin_chips().values():
+    for chip in CHIPS.built_in.values():
         if isinstance(chip.mapping, CorePerLayer):
             kinds = dict.fromkeys(chip.mapping.cores)
             words = [f"{chip.mapping.cores.count(k)} of {k.kernels_ki} and {k.neurons_ki}" for k in kinds]
@@ -146,7 +146,7 @@ def paper_part() -> str:
     network = build_network(config.network, observation_spec(suite), 0)
     shapes = layer_shapes(fold_agent(Agent(network, suite, config, torch.device("cpu"), 0)))
     rows = []
-    for name in builtin_chips():
+    for name in CHIPS.built_in:
         fit = check_fit(shapes, name)
         limits = [(layer.layer, limit) for layer in fit.layers for limit in layer.limits]
         limits += [("whole chip", limit) for limit in fit.limits]

@@ -6,46 +6,22 @@ docs/energy.md ("A chip of your own") explains every key.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
 from typing import Any, cast, get_args
 
 from switchmt_snn.config.plugins import is_plugin
-from switchmt_snn.errors import ConfigError, did_you_mean, nearest
+from switchmt_snn.errors import ConfigError, nearest
 from switchmt_snn.export.chips.chip import Chip
 from switchmt_snn.export.chips.limits import Only, Per, Resource
 from switchmt_snn.export.chips.mappings import ConvolutionCore, CorePerLayer, Mapping, SharedCore, WholeCores
 from switchmt_snn.export.chips.rules import RULES, Widths
 from switchmt_snn.export.chips.shapes import LAYER_KINDS
-from switchmt_snn.export.yaml_files import SUFFIXES, Section, builtin_files, file_text, parse
+from switchmt_snn.export.yaml_files import Catalog, Section
 from switchmt_snn.spiking.neurons import NEURONS
 
 _TEXTS = ("name", "title", "vendor", "source")
 _NEEDED = (*_TEXTS, "takes", "layers", "neurons", "weight_bits", "mapping", "limits")
 _OPTIONAL = ("kind", "state_bits", "notes")
 _OF_LIMIT = ("per", "only", "whole_channels", "source")
-
-
-@cache
-def builtin_chips() -> dict[str, Chip]:
-    """The chips that come with the package, by name."""
-    files = builtin_files("switchmt_snn.export.chips.builtin")
-    chips = [read_chip(parse(text, name), name) for name, text in files.items()]
-    return {chip.name: chip for chip in chips}
-
-
-def load_chip(name_or_file: str | Path) -> Chip:
-    """A built-in chip by name, or one from a YAML file.
-
-    Raises:
-        ConfigError: no such chip, or a file that is not one.
-    """
-    if Path(name_or_file).suffix in SUFFIXES:
-        return read_chip(parse(file_text(name_or_file), str(name_or_file)), str(name_or_file))
-    known, name = builtin_chips(), str(name_or_file)
-    if name not in known:
-        raise ConfigError(f"unknown chip {name!r}{did_you_mean(name, known)}")
-    return known[name]
 
 
 def read_chip(raw: Any, where: str) -> Chip:
@@ -144,3 +120,7 @@ def _mapping(file: Section) -> Mapping:
     rule = file.section("mapping", ("rule",), every).choice("rule", tuple(MAPPINGS))
     _, needed, read = MAPPINGS[rule]
     return read(file.section("mapping", ("rule", *needed)))
+
+
+CHIPS = Catalog("chip", "switchmt_snn.export.chips.builtin", read_chip)
+"""The chips that come with the package, and files of chips."""

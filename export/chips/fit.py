@@ -15,7 +15,7 @@ from typing import Any
 
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.chips.chip import Chip
-from switchmt_snn.export.chips.chip_file import load_chip
+from switchmt_snn.export.chips.chip_file import CHIPS
 from switchmt_snn.export.chips.limits import Limit
 from switchmt_snn.export.chips.shapes import LayerShape
 from switchmt_snn.spiking.folding import FoldedNetwork
@@ -187,7 +187,7 @@ def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
         >>> check_fit(layers, "loihi-1").fits
         True
     """
-    on = chip if isinstance(chip, Chip) else load_chip(chip)
+    on = chip if isinstance(chip, Chip) else CHIPS.load(chip)
     fits = [
         LayerFit(
             layer=layer.name,

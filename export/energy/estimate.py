@@ -7,15 +7,13 @@ count is reported as not included.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.counts.network import LayerCounts, TaskCounts
 from switchmt_snn.export.energy.traffic import Traffic, ann_traffic, traffic
-from switchmt_snn.export.yaml_files import SUFFIXES, Section, builtin_files, check_number, file_text, parse
+from switchmt_snn.export.yaml_files import Catalog, Section, check_number
 
 UNITS_PJ = {"fJ": 1e-3, "pJ": 1.0, "nJ": 1e3}
 EVIDENCE = ("measured", "simulated", "estimated", "reported")
@@ -215,28 +213,6 @@ def _memory_pj(accesses: Traffic, layer: LayerCounts, memory: Memory) -> dict[st
     }
 
 
-@cache
-def builtin_targets() -> dict[str, Target]:
-    """The targets that come with the package, by name."""
-    files = builtin_files("switchmt_snn.export.energy.targets")
-    targets = [read_target(parse(text, name), name) for name, text in files.items()]
-    return {target.name: target for target in targets}
-
-
-def load_target(name_or_file: str | Path) -> Target:
-    """A built-in target by name, or one from a YAML file.
-
-    Raises:
-        ConfigError: no such target, or a file that is not one.
-    """
-    if Path(name_or_file).suffix in SUFFIXES:
-        return read_target(parse(file_text(name_or_file), str(name_or_file)), str(name_or_file))
-    known, name = builtin_targets(), str(name_or_file)
-    if name not in known:
-        raise ConfigError(f"unknown target {name!r}{did_you_mean(name, known)}")
-    return known[name]
-
-
 def read_target(raw: Any, where: str) -> Target:
     """A target from the keys and values of its file.
 
@@ -276,3 +252,7 @@ def _memory(section: Section, factor: float) -> Memory:
             )
     bits = {key: section.whole(key, 1, 1024, "bits") for key in _MEMORY if key.endswith("_bits")}
     return Memory(bits["access_bits"], dict(by_size), bits["weight_bits"], bits["state_bits"])
+
+
+TARGETS = Catalog("energy target", "switchmt_snn.export.energy.targets", read_target)
+"""The energy targets that come with the package, and files of targets."""

@@ -8,13 +8,13 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NewType
 
 from switchmt_snn.config.strict_yaml import parse_yaml
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.errors import ConfigError, SwitchMTError
 
 PluginName = NewType("PluginName", str)
 """A config value that names a class from outside the package: ``package.module:Name``."""
@@ -121,6 +121,35 @@ def failure(error: BaseException) -> str:
         if not frame.filename.startswith((ours, "<")) and not any(part in frame.filename for part in installed)
     ]
     return f"{text} at {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else text
+
+
+@contextlib.contextmanager
+def user_code(
+    seen: str, expected: str, kind: type[SwitchMTError] = ConfigError, outside: bool = True
+) -> Iterator[None]:
+    """Around a call of code from outside the package: what it raises becomes the one line of an error.
+
+    The line is ``SEEN (FAILURE), expected EXPECTED``, with ``failure`` in the middle. An error that this package raises
+    on purpose has its line already and goes through.
+
+    Args:
+        seen: the class and what fails, as ``network.encoding is 'my_module:Mine', which fails in encode``.
+        expected: what the contract wants of the code, or what to do.
+        kind: the error's class.
+        outside: whether the code is from outside the package. False lets everything through: it is a fault of ours,
+            and its traceback is needed.
+
+    Raises:
+        SwitchMTError: of class ``kind``.
+    """
+    try:
+        yield
+    except SwitchMTError:
+        raise
+    except Exception as error:
+        if not outside:
+            raise
+        raise kind(f"{seen} ({failure(error)}), expected {expected}") from error
 
 
 def plugin_options(options: Sequence[str], key: str) -> dict[str, bool | int | float | str]:

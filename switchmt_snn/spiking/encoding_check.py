@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.errors import ConfigError, shown
 from switchmt_snn.spiking.apart import apart
 from switchmt_snn.spiking.encodings import Encoding, encoding_code, make_encoding
 
@@ -17,8 +17,9 @@ def try_encoding(config: NetworkConfig, shape: tuple[int, ...], frame_stack: int
     """Encode made-up observations, so that a mistake in a class from outside shows before training.
 
     Checked: the constructor, ``steps`` and ``channels``; shape and dtype of the inputs; that they are finite, and 0 or
-    1 if the class makes spikes; that ``encode`` leaves its argument as it is; and that the inputs follow from the
-    observations and the generator alone, which exact resume needs.
+    1 if the class makes spikes; that ``encode`` leaves its argument as it is; that the inputs follow from the
+    observations and the generator alone, which exact resume needs; and that those of one observation do not depend on
+    the others of its batch, because training encodes 32 at a time and an agent one.
 
     Args:
         config: names the encoding.
@@ -32,11 +33,11 @@ def try_encoding(config: NetworkConfig, shape: tuple[int, ...], frame_stack: int
     with apart():
         encoding = make_encoding(config, frame_stack, in_unit_range)
         tried = _Tried(encoding, config.encoding)
-        observations = torch.rand((2, *shape))
+        observations = torch.rand((3, *shape))
         if not in_unit_range:
             observations = 8.0 * observations - 4.0
         observations[0].round_()  # whole numbers, too: pixels are 0 and 1 in many tasks
-        tried.check(observations)
+        tried.check(observations[:2].clone(), observations[2])
 
 
 class _Tried:
@@ -45,14 +46,14 @@ class _Tried:
     def __init__(self, encoding: Encoding, name: str) -> None:
         self._encoding, self._name = encoding, name
 
-    def check(self, observations: Tensor) -> None:
-        """Encode observations ``[2, k*c, ...]``, others, and the same again."""
+    def check(self, observations: Tensor, other: Tensor) -> None:
+        """Encode observations ``[2, k*c, ...]``, the same again, and each of them beside another ``[k*c, ...]``."""
         self._require_channels(observations.shape[1])
         inputs = self._encoded(observations)
         if not bool(inputs.isfinite().all()):
-            other = inputs[~inputs.isfinite()][0].item()
+            worst = inputs[~inputs.isfinite()][0].item()
             low, high = observations.min(), observations.max()
-            self._refuse(f"gives {other:g} for observations from {low:g} to {high:g}", "finite numbers")
+            self._refuse(f"gives {worst:g} for observations from {low:g} to {high:g}", "finite numbers")
         if self._encoding.makes_spikes and not bool(((inputs == 0) | (inputs == 1)).all()):
             self._refuse(
                 f"gives values from {inputs.min():g} to {inputs.max():g}",
@@ -72,6 +73,15 @@ class _Tried:
                 )
         elif not torch.equal(inputs, self._encoded(observations, seed=1, global_seed=1)):
             self._refuse("draws random numbers", "is_random = True, and all of them from its generator")
+        for row in range(2):
+            mixed = observations.clone()
+            mixed[1 - row] = other
+            if not torch.equal(self._encoded(mixed)[:, row], inputs[:, row]):
+                self._refuse(
+                    "gives an observation other inputs when another one is beside it in the batch",
+                    "inputs that follow from each observation alone; x.mean(), for example, is over the batch, too; "
+                    "x.flatten(1).mean(1) is not",
+                )
 
     def _require_channels(self, observation_channels: int) -> None:
         expected = "channels(observation_channels, frame_stack) -> int"
@@ -79,7 +89,9 @@ class _Tried:
         with encoding_code(self._name, "channels", expected):
             channels: Any = self._encoding.channels(observation_channels, stack)
         if not (isinstance(channels, int) and channels > 0):
-            self._refuse(f"gives {channels!r} from channels({observation_channels}, {stack})", "a number of channels")
+            self._refuse(
+                f"gives {shown(channels)} from channels({observation_channels}, {stack})", "a number of channels"
+            )
 
     def _encoded(self, observations: Tensor, seed: int = 0, global_seed: int = 0) -> Tensor:
         """Inputs for observations that no call may change."""

@@ -9,17 +9,16 @@ Shapes: T simulation steps, B batch, k frames per stack, c channels per frame, C
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.config.network import ENCODING_NAMES
-from switchmt_snn.config.plugins import failure, is_plugin, load_plugin
-from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
+from switchmt_snn.config.plugins import is_plugin, user_code
+from switchmt_snn.config.registry import Registry
+from switchmt_snn.errors import ConfigError, shown
 
 
 class Encoding:
@@ -77,7 +76,7 @@ class Encoding:
         shape = (steps, x.shape[0], self.channels(x.shape[1], self.frame_stack), *x.shape[2:])
         if not isinstance(inputs, Tensor):
             raise ConfigError(
-                f"encoding {type(self).__name__} gave {inputs!r} from encode, expected a tensor of shape {shape}"
+                f"encoding {type(self).__name__} gave {shown(inputs)} from encode, expected a tensor of shape {shape}"
             )
         if inputs.shape != shape or inputs.dtype != x.dtype:
             raise ConfigError(
@@ -85,50 +84,6 @@ class Encoding:
                 f"{x.dtype} of shape {shape} (steps, batch, channels, ...); see its channels and constant_over_time"
             )
         return inputs
-
-
-ENCODINGS: dict[str, type[Encoding]] = {}
-"""The encodings of this package, by the name that ``network.encoding`` takes."""
-
-_E = TypeVar("_E", bound=type[Encoding])
-
-
-def register_encoding(name: str) -> Callable[[_E], _E]:
-    """Class decorator: makes an encoding of this package known by a name.
-
-    Raises:
-        ConfigError: the config does not take the name, the name is taken, or the class is no encoding.
-    """
-
-    def register(encoding: _E) -> _E:
-        if name not in ENCODING_NAMES:
-            raise ConfigError(
-                f"encoding {name!r} is not a value of network.encoding, expected one of {', '.join(ENCODING_NAMES)}; "
-                "add it to EncodingName in switchmt_snn/config/network.py, or use package.module:Class"
-            )
-        if ENCODINGS.get(name, encoding) is not encoding:
-            raise ConfigError(f"encoding {name!r} is {ENCODINGS[name].__name__}, expected a name that is free")
-        check_encoding(encoding, name)
-        ENCODINGS[name] = encoding
-        return encoding
-
-    return register
-
-
-def encoding_class(name: str) -> type[Encoding]:
-    """The class that ``network.encoding`` names: of this package, or ``package.module:Class``.
-
-    Raises:
-        ConfigError: the name is unknown, cannot be imported, or is no encoding.
-    """
-    if name in ENCODINGS:
-        return ENCODINGS[name]
-    if is_plugin(name):
-        return check_encoding(load_plugin(name, "network.encoding"), name)
-    raise ConfigError(
-        f"network.encoding is {name!r}, expected one of {', '.join(ENCODINGS)}, or package.module:Class"
-        f"{did_you_mean(name, ENCODINGS)}"
-    )
 
 
 def check_encoding(encoding: Any, name: str) -> type[Encoding]:
@@ -155,6 +110,12 @@ def check_encoding(encoding: Any, name: str) -> type[Encoding]:
     return encoding
 
 
+ENCODINGS: Registry[type[Encoding]] = Registry(NetworkConfig, "network.encoding", check_encoding)
+"""The encodings of this package, by the name that ``network.encoding`` takes."""
+
+register_encoding, encoding_class = ENCODINGS.register, ENCODINGS.find
+
+
 def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) -> Encoding:
     """The encoding of a resolved config.
 
@@ -178,7 +139,7 @@ def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) 
         steps: Any = cls.steps(frame_stack)
     if not (steps is None or (isinstance(steps, int) and steps > 0)):
         raise ConfigError(
-            f"network.encoding is {config.encoding!r}, whose steps gave {steps!r} for frame_stack {frame_stack}, "
+            f"network.encoding is {config.encoding!r}, whose steps gave {shown(steps)} for frame_stack {frame_stack}, "
             "expected a number of simulation steps, or None if any will do"
         )
     if steps is not None and config.timesteps != steps:
@@ -197,23 +158,9 @@ def make_encoding(config: NetworkConfig, frame_stack: int, in_unit_range: bool) 
     return encoding
 
 
-@contextmanager
-def encoding_code(name: str, where: str, expected: str) -> Iterator[None]:
-    """Around a call of an encoding: what a class from outside the package raises becomes one line.
-
-    Raises:
-        ConfigError: naming the class and the line of its code.
-    """
-    try:
-        yield
-    except SwitchMTError:
-        raise
-    except Exception as error:
-        if not is_plugin(name):
-            raise
-        raise ConfigError(
-            f"network.encoding is {name!r}, which fails in {where} ({failure(error)}), expected {expected}"
-        ) from error
+def encoding_code(name: str, where: str, expected: str) -> AbstractContextManager[None]:
+    """Around a call of the encoding that ``network.encoding`` names; see ``user_code``."""
+    return user_code(f"network.encoding is {name!r}, which fails in {where}", expected, outside=is_plugin(name))
 
 
 @register_encoding("direct")

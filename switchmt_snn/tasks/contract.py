@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.config.plugins import failure
-from switchmt_snn.errors import SwitchMTError, TaskError
+from switchmt_snn.config.plugins import user_code
+from switchmt_snn.errors import TaskError, shown
 from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
 
 METHODS = {
@@ -78,13 +77,13 @@ class CheckedEnvironment:
                 continue
             if np.shape(values) != (self.num_envs,) or np.asarray(values).dtype.kind not in kinds:
                 raise TaskError(
-                    f"task {self._name!r} gave {name} = {values!r}, expected an array of {self.num_envs} "
+                    f"task {self._name!r} gave {name} = {shown(values)}, expected an array of {self.num_envs} "
                     f"{'truth values' if kinds == 'b' else 'numbers'}, one for each copy"
                 )
         if not (np.abs(result.rewards) <= LARGEST_REWARD).all():
             raise TaskError(
-                f"task {self._name!r} gave the rewards {np.asarray(result.rewards).tolist()}, expected finite numbers "
-                "(float32); mend the environment's reward"
+                f"task {self._name!r} gave the rewards {shown(np.asarray(result.rewards).tolist())}, expected "
+                "finite numbers (float32); mend the environment's reward"
             )
         return result
 
@@ -92,15 +91,8 @@ class CheckedEnvironment:
         """Free the copies."""
         self._environment.close()
 
-    @contextmanager
-    def _code(self, where: str, expected: str) -> Iterator[None]:
-        """Around a call of code from outside: what it raises becomes one line."""
-        try:
-            yield
-        except SwitchMTError:
-            raise
-        except Exception as error:
-            raise TaskError(f"task {self._name!r} fails in {where} ({failure(error)}), expected {expected}") from error
+    def _code(self, where: str, expected: str) -> AbstractContextManager[None]:
+        return user_code(f"task {self._name!r} fails in {where}", expected, TaskError)
 
     def _require_frames(self, frames: Frames, count: int) -> None:
         if not isinstance(frames, np.ndarray):

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from switchmt_snn.config import TasksConfig, resolved_frame_stack
-from switchmt_snn.config.plugins import failure
-from switchmt_snn.errors import SwitchMTError, TaskError
+from switchmt_snn.config.plugins import user_code
+from switchmt_snn.errors import TaskError, shown
 from switchmt_snn.tasks.suite import PublishedScores, Reference, Suite, TaskSuite
 
 
@@ -21,23 +21,9 @@ def is_outside(suite: type[Suite]) -> bool:
     return not suite.__module__.startswith("switchmt_snn.")
 
 
-@contextmanager
-def suite_code(suite: type[Suite], name: str, where: str) -> Iterator[None]:
-    """Around a call of a suite: what a class from outside the package raises becomes one line.
-
-    Raises:
-        TaskError: naming the suite, as a config does, and the line of its code.
-    """
-    try:
-        yield
-    except SwitchMTError:
-        raise
-    except Exception as error:
-        if not is_outside(suite):
-            raise
-        raise TaskError(
-            f"the suite {name!r} fails in {where} ({failure(error)}), expected no error; mend it"
-        ) from error
+def suite_code(suite: type[Suite], name: str, where: str) -> AbstractContextManager[None]:
+    """Around a call of the suite that a config names; see ``user_code``."""
+    return user_code(f"the suite {name!r} fails in {where}", "no error; mend it", TaskError, is_outside(suite))
 
 
 def require_facts(suite: Suite, config: TasksConfig) -> None:
@@ -58,7 +44,7 @@ def require_facts(suite: Suite, config: TasksConfig) -> None:
         with suite_code(type(suite), config.suite, fact):
             value = getattr(suite, fact)
         if not holds(value):
-            raise TaskError(f"the suite {config.suite!r} states {fact} = {value!r}, expected {expected}")
+            raise TaskError(f"the suite {config.suite!r} states {fact} = {shown(value)}, expected {expected}")
 
 
 def require_tasks(tasks: Any, config: TasksConfig) -> TaskSuite:
@@ -68,7 +54,9 @@ def require_tasks(tasks: Any, config: TasksConfig) -> TaskSuite:
         TaskError: naming the field, what was seen, and what was expected.
     """
     if not isinstance(tasks, TaskSuite):
-        raise TaskError(f"the suite {config.suite!r} gave {tasks!r} from make, expected a TaskSuite; change its make()")
+        raise TaskError(
+            f"the suite {config.suite!r} gave {shown(tasks)} from make, expected a TaskSuite; change its make()"
+        )
     count, stack = len(config.names), resolved_frame_stack(config)
     fields: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         ("names", _writable, "printable names without commas and quotes, which tables could not hold"),
@@ -96,9 +84,9 @@ def require_tasks(tasks: Any, config: TasksConfig) -> TaskSuite:
     for name, holds, expected in fields:
         value = getattr(tasks, name)
         if not holds(value):
-            shown = value if isinstance(value, tuple) else " ".join(repr(value).split())
             raise TaskError(
-                f"the suite {config.suite!r} makes tasks of {name} {shown}, expected {expected}; change its make()"
+                f"the suite {config.suite!r} makes tasks of {name} {shown(value)}, expected {expected}; change "
+                "its make()"
             )
     return tasks
 

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.errors import TaskError
+from switchmt_snn.errors import TaskError, shown
 from switchmt_snn.tasks.randomness import OwnGenerators
 from switchmt_snn.tasks.suite import Frames, VectorStep
 
@@ -110,12 +110,12 @@ class GymCopies:
     def _one_number(self, name: str, value: Any) -> float:
         if isinstance(value, (float, int)) or (np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"):
             return float(value)
-        raise TaskError(f"task {self._name!r} gave {name} = {value!r}, expected one number")
+        raise TaskError(f"task {self._name!r} gave {name} = {shown(value)}, expected one number")
 
     def _truth(self, name: str, value: Any) -> bool:
         if isinstance(value, (bool, np.bool_)) or (np.ndim(value) == 0 and value in (0, 1)):
             return bool(value)
-        raise TaskError(f"task {self._name!r} gave {name} = {value!r}, expected True or False")
+        raise TaskError(f"task {self._name!r} gave {name} = {shown(value)}, expected True or False")
 
 
 _NOTHING: contextlib.AbstractContextManager[None] = contextlib.nullcontext()

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from switchmt_snn.config.plugins import failure, import_plugin_module, is_plugin, load_plugin
+from switchmt_snn.config.plugins import import_plugin_module, is_plugin, load_plugin, user_code
 from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
 from switchmt_snn.errors import TaskError, did_you_mean, nearest
 from switchmt_snn.tasks.gym_copies import Env
@@ -103,6 +103,15 @@ def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
     module, env_id = parse_id(name)
     if module is not None:
         _import(name, module)
+    expected = "a Gymnasium environment with observation_space and action_space"
+    with user_code(f"task {name!r} cannot be made", expected, TaskError):
+        env = _registered(name, env_id if colon else name)
+    for wrapper in wrappers:
+        env = _wrapped(name, env, wrapper)
+    return env
+
+
+def _registered(name: str, env_id: str) -> Env:
     try:
         env: Env = gymnasium.make(env_id)
     except gymnasium.error.DependencyNotInstalled as error:
@@ -115,27 +124,17 @@ def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
         ) from error
     except gymnasium.error.UnregisteredEnv as error:
         raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{_hint(name)}") from error
-    except Exception as error:  # whatever the environment's own code raises
-        raise TaskError(
-            f"task {name!r} cannot be made ({failure(error)}), expected a Gymnasium environment with observation_space "
-            "and action_space"
-        ) from error
-    for wrapper in wrappers:
-        env = _wrapped(name, env, wrapper)
     return env
 
 
 def _wrapped(name: str, env: Env, wrapper: str) -> Env:
     make = load_plugin(wrapper, "tasks.wrappers") if is_plugin(wrapper) else WRAPPERS[wrapper]
-    try:
-        wrapped = make(env)
-    except TaskError as error:
-        raise TaskError(f"task {name!r}: {error}") from error
-    except Exception as error:  # whatever the wrapper's own code raises
-        raise TaskError(
-            f"task {name!r} does not take the wrapper {wrapper} ({failure(error)}), expected one for "
-            f"{env.observation_space} and {env.action_space}"
-        ) from error
+    expected = f"one for {env.observation_space} and {env.action_space}"
+    with user_code(f"task {name!r} does not take the wrapper {wrapper}", expected, TaskError):
+        try:
+            wrapped = make(env)
+        except TaskError as error:
+            raise TaskError(f"task {name!r}: {error}") from error
     if not isinstance(wrapped, gymnasium.Env):
         raise TaskError(
             f"tasks.wrappers has {wrapper}, which made a {type(wrapped).__name__}, expected a gymnasium.Env"

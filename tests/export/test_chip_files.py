@@ -12,7 +12,7 @@ import yaml
 
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.chips.chip import Chip
-from switchmt_snn.export.chips.chip_file import MAPPINGS, builtin_chips, load_chip, read_chip
+from switchmt_snn.export.chips.chip_file import CHIPS, MAPPINGS, read_chip
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.rules import RULES, Widths
 from switchmt_snn.export.chips.shapes import LayerShape
@@ -303,9 +303,9 @@ def test_a_name_of_both_kinds_selects_both_and_no_name_everything() -> None:
 
 def test_built_in_files_bear_their_chips_names() -> None:
     folder = ROOT / "export" / "chips" / "builtin"
-    assert {path.stem for path in folder.glob("*.yaml")} == set(builtin_chips()) == set(BUILT_IN)
+    assert {path.stem for path in folder.glob("*.yaml")} == set(CHIPS.built_in) == set(BUILT_IN)
     for path in folder.glob("*.yaml"):
-        assert load_chip(path) == builtin_chips()[path.stem]
+        assert CHIPS.load(path) == CHIPS.built_in[path.stem]
 
 
 def test_fits_are_plain_json(tmp_path: Path) -> None:

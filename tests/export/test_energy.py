@@ -11,7 +11,7 @@ import yaml
 
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.counts.network import LayerCounts, TaskCounts
-from switchmt_snn.export.energy.estimate import Memory, Target, builtin_targets, estimate, load_target, read_target
+from switchmt_snn.export.energy.estimate import TARGETS, Memory, Target, estimate, read_target
 from switchmt_snn.export.energy.traffic import traffic
 from switchmt_snn.export.yaml_files import parse
 from tests.export.export_cases import RunCommand
@@ -142,7 +142,7 @@ def test_memory_is_read_for_every_operation() -> None:
 
 
 def test_built_in_targets_have_origin_and_price() -> None:
-    targets = builtin_targets()
+    targets = TARGETS.built_in
     assert {"cmos45-fp32", "cmos45-int8", "loihi-2018", "loihi-sanafe"} <= set(targets)
     by_chip: dict[str, int] = {}
     for name, target in targets.items():
@@ -199,13 +199,13 @@ def test_a_missing_source_and_text_that_is_no_target(tmp_path: Path) -> None:
     for text, message in ((yaml.safe_dump(without), "has no source"), ("[1, 2", "is not YAML"), ("7", "expected keys")):
         with pytest.raises(ConfigError, match=message):
             target(text)
-    with pytest.raises(ConfigError, match="unknown target 'loihi-2081'; did you mean 'loihi-2018'"):
-        load_target("loihi-2081")
+    with pytest.raises(ConfigError, match="unknown energy target 'loihi-2081'; did you mean 'loihi-2018'"):
+        TARGETS.load("loihi-2081")
     with pytest.raises(ConfigError, match="cannot be read"):
-        load_target("nowhere.yaml")
+        TARGETS.load("nowhere.yaml")
     (tmp_path / "latin.yaml").write_bytes("title: 1 \u00b5J".encode("latin-1"))
     with pytest.raises(ConfigError, match="not UTF-8 text"):
-        load_target(str(tmp_path / "latin.yaml"))
+        TARGETS.load(str(tmp_path / "latin.yaml"))
 
 
 def test_a_target_of_ones_own(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.export.chips.chip_file import builtin_chips
+from switchmt_snn.export.chips.chip_file import CHIPS
 from switchmt_snn.export.chips.fit import ChipFit, check_fit, layer_shapes
 from switchmt_snn.export.chips.mappings import CorePerLayer, assign_cores, convolution_memory_ki
 from switchmt_snn.export.chips.shapes import LayerShape
@@ -27,7 +27,7 @@ from switchmt_snn.export.folded import fold_agent
 from tests.export.chip_networks import ATARI, BUILT_IN, CONVOLUTIONS, GOLDEN, chain, conv, golden_fits, linear
 from tests.export.export_cases import make_agent
 
-SPECK = builtin_chips()["speck"].mapping
+SPECK = CHIPS.built_in["speck"].mapping
 assert isinstance(SPECK, CorePerLayer)
 SPECK_CORES = [(core.kernels_ki, core.neurons_ki) for core in SPECK.cores]
 
@@ -261,8 +261,8 @@ def test_inputs_that_are_no_spikes_need_a_host() -> None:
 
 
 def test_every_chip_has_its_source_and_says_what_it_leaves_out() -> None:
-    assert set(builtin_chips()) == set(BUILT_IN)
-    for name, chip in builtin_chips().items():
+    assert set(CHIPS.built_in) == set(BUILT_IN)
+    for name, chip in CHIPS.built_in.items():
         assert (chip.name, bool(chip.source), len(chip.notes) > 1) == (name, True, True)
     with pytest.raises(ConfigError, match="unknown chip 'loihi1'; did you mean 'loihi-1'"):
         check_fit(ATARI, "loihi1")

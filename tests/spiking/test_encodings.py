@@ -243,6 +243,33 @@ class Logarithm(Inverted):
         return x.log().unsqueeze(0)
 
 
+class SubtractsTheMeanOfTheBatch(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return (x - x.mean()).unsqueeze(0)
+
+
+class EncodesTheFirstOnly(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x[:1].expand_as(x).unsqueeze(0)
+
+
+class EncodesTheBatchInReverse(Inverted):
+    is_random = True
+
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x.flip(0).unsqueeze(0) * torch.rand(x.shape, generator=generator)
+
+
+class SubtractsTheMeanOfEach(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return (x - x.flatten(1).mean(1).view(-1, 1, 1, 1)).unsqueeze(0)
+
+
+class GivesNumpy(Inverted):
+    def encode(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        return x.unsqueeze(0).numpy()  # type: ignore[return-value]
+
+
 class StepsOfAnInstance(Inverted):
     def steps(self, frame_stack: int) -> int | None:  # type: ignore[override]
         return frame_stack
@@ -293,6 +320,14 @@ class ForgetsItsParent(Inverted):
         (RandomFromTorch, r"draws random numbers that are not its generator's, expected .*generator=generator"),
         (RandomFromItsGenerator, None),
         (Logarithm, "gives -inf for observations from 0 to 1, expected finite numbers"),
+        (
+            SubtractsTheMeanOfTheBatch,
+            "gives an observation other inputs when another one is beside it in the batch, exp",
+        ),
+        (EncodesTheFirstOnly, "gives an observation other inputs when another one is beside it in the batch, exp"),
+        (EncodesTheBatchInReverse, "gives an observation other inputs when another one is beside it in the batch, exp"),
+        (SubtractsTheMeanOfEach, None),
+        (GivesNumpy, r"gave a float32 ndarray of shape \(1, 2, 4, 5, 5\) from encode, expected a tensor of shape"),
         (StepsOfAnInstance, r"whose steps is no classmethod, expected @classmethod, def steps\(cls, frame_stack\)"),
         (ChannelsOfAnInstance, "whose channels is no classmethod, expected @classmethod, def channels"),
         (StepsAsText, "whose steps gave '3' for frame_stack 2, expected a number of simulation steps, or None"),
@@ -308,6 +343,7 @@ def test_an_encoding_from_outside_is_tried_before_training(encoding: type, compl
     if complaint is None:
         try_encoding(config, (4, 5, 5), 2, True)
     else:
-        with pytest.raises(ConfigError, match=complaint):
+        with pytest.raises(ConfigError, match=complaint) as caught:
             try_encoding(config, (4, 5, 5), 2, True)
+        assert "\n" not in str(caught.value)
     assert torch.equal(before, torch.get_rng_state())

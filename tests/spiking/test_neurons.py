@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
+from switchmt_snn.config.network import SURROGATES_WITHOUT_SLOPE
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.neurons import (
     NEURONS,
@@ -201,8 +202,10 @@ def test_a_step_changes_nothing_but_what_it_returns(neuron: str) -> None:
     assert set(first[0].unique().tolist()) <= {0.0, 1.0}
 
 
-@pytest.mark.parametrize("slope", [None, 0.5, 40.0])
-@pytest.mark.parametrize("name", DETERMINISTIC)
+@pytest.mark.parametrize(
+    ("name", "slope"),
+    [(name, slope) for name in DETERMINISTIC for slope in (None, 0.5, 40.0) if SURROGATES[name] or slope is None],
+)
 def test_surrogate_gradients_equal_snntorchs(name: str, slope: float | None) -> None:
     """Far from the threshold and at it, in place."""
     x = torch.cat([torch.linspace(-9, 9, 3001), torch.tensor([0.0, 1e-30, -1e-30])]).requires_grad_()
@@ -302,23 +305,30 @@ def test_the_registry_and_the_config_know_the_same_names() -> None:
     literal, _ = get_args(hints["neuron"])
     assert get_args(literal) == tuple(NEURONS)
     assert get_args(hints["surrogate"]) == tuple(SURROGATES)
+    assert {name for name, argument in SURROGATES.items() if argument is None} == set(SURROGATES_WITHOUT_SLOPE)
 
 
 def test_a_name_is_registered_once() -> None:
-    with pytest.raises(ValueError, match="'LIF' is registered already"):
-        register_neuron("LIF", LeakyLayer)
+    with pytest.raises(ConfigError, match="neuron 'LIF' is LeakyLayer, expected a name that is free"):
+        register_neuron("LIF")(ReLULayer)
+    with pytest.raises(ConfigError, match=r"neuron 'GLIF' is not a value of network\.neuron, expected one of IF"):
+        register_neuron("GLIF")(LeakyLayer)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"neuron": "Izhikevich"}, "network.neuron is 'Izhikevich', expected IF or LIF or Synaptic or ALIF; a class"),
+        ({"neuron": "Izhikevich"}, "network.neuron is 'Izhikevich', expected one of IF, LIF, Synaptic, ALIF, or pack"),
         (
             {"neuron": "ALIF", "neuron_engine": "snntorch"},
             "'snntorch', expected fused; network.neuron is ALIF",
         ),
         ({"neuron_engine": "eager"}, "network.neuron_engine is 'eager', expected fused or snntorch"),
         ({"reset": "none"}, "network.reset is 'none', expected zero or subtract"),
+        (
+            {"surrogate": "SSO", "surrogate_slope": 2.0},
+            "surrogate_slope is 2.0, expected null with network.surrogate=SSO",
+        ),
         ({"surrogate": "atam"}, "network.surrogate is 'atam', expected atan or .*; did you mean 'atan'?"),
     ],
 )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
 from switchmt_snn.config.plugins import is_plugin
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.errors import ConfigError, shown
 from switchmt_snn.learning.state import Stateful, require_storable
 from switchmt_snn.learning.switching.criterion import (
     EpisodeRecord,
@@ -162,7 +162,8 @@ class SwitchingPolicy(Stateful):
         name = type(self.criterion).__name__
         if not isinstance(verdict, Verdict):
             raise ConfigError(
-                f"criterion {name} returned {verdict!r} from end_of_episode, expected Verdict(leave, reason, measured)"
+                f"criterion {name} returned {shown(verdict)} from end_of_episode, expected "
+                "Verdict(leave, reason, measured)"
             )
         if not (
             isinstance(verdict.leave, (bool, np.bool_))
@@ -170,7 +171,8 @@ class SwitchingPolicy(Stateful):
             and isinstance(verdict.measured, dict)
         ):
             raise ConfigError(
-                f"criterion {name} returned {verdict}, expected leave True or False, reason a text, and measured a dict"
+                f"criterion {name} returned {shown(verdict)}, expected leave True or False, reason a text, and "
+                "measured a dict"
             )
         for name in verdict.measured:
             if name not in self.columns:
@@ -188,8 +190,8 @@ class SwitchingPolicy(Stateful):
             number = math.nan
         if math.isnan(number) and (is_plugin(self.config.policy) or not isinstance(value, float)):
             raise ConfigError(
-                f"criterion {type(self.criterion).__name__} measured {column!r} as {value!r}, expected a number; leave "
-                "it out of measured while it has none"
+                f"criterion {type(self.criterion).__name__} measured {column!r} as {shown(value)}, expected a number; "
+                "leave it out of measured while it has none"
             )
         return number
 

@@ -7,16 +7,17 @@ must know: the columns of switches.csv, the memory it takes, the line on the scr
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
-from switchmt_snn.config import POLICIES, SwitchingConfig
-from switchmt_snn.config.plugins import failure, is_plugin, load_plugin, plugin_name, plugin_options
-from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
+from switchmt_snn.config import SwitchingConfig
+from switchmt_snn.config.plugins import is_plugin, plugin_name, plugin_options, user_code
+from switchmt_snn.config.registry import Registry
+from switchmt_snn.errors import ConfigError, did_you_mean, shown
 from switchmt_snn.learning.state import Stateful
 
 DECISION_COLUMNS = (
@@ -105,49 +106,6 @@ class Criterion(Stateful):
         raise NotImplementedError(f"{type(self).__name__} defines no end_of_episode, expected its rule")
 
 
-CRITERIA: dict[str, type[Criterion]] = {}
-"""The criteria of this package, by the name that ``switching.policy`` takes."""
-
-_C = TypeVar("_C", bound=type[Criterion])
-
-
-def register_criterion(name: str) -> Callable[[_C], _C]:
-    """Class decorator: makes a criterion of this package known by a name.
-
-    Raises:
-        ConfigError: the config does not take the name, the name is taken, or the class is no criterion.
-    """
-
-    def register(criterion: _C) -> _C:
-        if name not in POLICIES:
-            raise ConfigError(
-                f"criterion {name!r} is not a value of switching.policy, expected one of {', '.join(POLICIES)}; add it "
-                "to Policy in switchmt_snn/config/switching.py, or use package.module:Class"
-            )
-        if CRITERIA.get(name, criterion) is not criterion:
-            raise ConfigError(f"criterion {name!r} is {CRITERIA[name].__name__}, expected a name that is free")
-        CRITERIA[name] = check_criterion(criterion, name)
-        return criterion
-
-    return register
-
-
-def criterion_class(policy: str) -> type[Criterion]:
-    """The class that a resolved ``switching.policy`` names: of this package, or ``package.module:Class``.
-
-    Raises:
-        ConfigError: the policy is unknown, cannot be imported, or is no criterion.
-    """
-    if policy in CRITERIA:
-        return CRITERIA[policy]
-    if is_plugin(policy):
-        return check_criterion(load_plugin(policy, "switching.policy"), policy)
-    raise ConfigError(
-        f"switching.policy is {policy!r}, expected one of {', '.join(CRITERIA)}, or package.module:Class"
-        f"{did_you_mean(policy, CRITERIA)}"
-    )
-
-
 def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
     """Return the class if it is a whole criterion.
 
@@ -183,6 +141,12 @@ def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
                 f"{', '.join(DECISION_COLUMNS)}"
             )
     return criterion
+
+
+CRITERIA: Registry[type[Criterion]] = Registry(SwitchingConfig, "switching.policy", check_criterion)
+"""The criteria of this package, by the name that ``switching.policy`` takes."""
+
+register_criterion, criterion_class = CRITERIA.register, CRITERIA.find
 
 
 def with_policy(config: SwitchingConfig, criterion: type[Criterion]) -> SwitchingConfig:
@@ -235,28 +199,15 @@ def make_criterion(config: SwitchingConfig) -> Criterion:
         held: Any = criterion.snapshots(config)
     if not isinstance(held, int) or held < 0:
         raise ConfigError(
-            f"switching.policy is {config.policy!r}, whose snapshots gave {held!r}, expected a whole number from 0"
+            f"switching.policy is {config.policy!r}, whose snapshots gave {shown(held)}, expected a whole number from 0"
         )
     return criterion
 
 
-@contextmanager
-def criterion_code(policy: str, where: str) -> Iterator[None]:
-    """Around a call of a criterion: what a class from outside the package raises becomes one line.
-
-    Raises:
-        ConfigError: naming the class and the line of its code.
-    """
-    try:
-        yield
-    except SwitchMTError:
-        raise
-    except Exception as error:
-        if not is_plugin(policy):
-            raise
-        raise ConfigError(
-            f"switching.policy is {policy!r}, which fails in {where} ({failure(error)}), expected no error; mend it"
-        ) from error
+def criterion_code(policy: str, where: str) -> AbstractContextManager[None]:
+    """Around a call of the criterion that ``switching.policy`` names; see ``user_code``."""
+    seen = f"switching.policy is {policy!r}, which fails in {where}"
+    return user_code(seen, "no error; mend it", outside=is_plugin(policy))
 
 
 def _require_kind(parameter: inspect.Parameter, value: Any) -> None:

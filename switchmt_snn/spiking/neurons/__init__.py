@@ -11,8 +11,11 @@ The ANN methods have ReLULayer (relu.py). A class from outside the package is na
 
 from __future__ import annotations
 
+from typing import Any
+
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.config.plugins import is_plugin, load_plugin
+from switchmt_snn.config.plugins import is_plugin
+from switchmt_snn.config.registry import Registry
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.neurons.adaptive import AdaptiveLayer, AdaptiveNode
 from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState, OpaqueNode
@@ -26,45 +29,26 @@ from switchmt_snn.spiking.neurons.surrogates import (
     make_surrogate_gradient,
 )
 from switchmt_snn.spiking.neurons.synaptic import SynapticLayer, SynapticNode
-from switchmt_snn.spiking.settings import require_known
 
-NEURONS: dict[str, type[NeuronLayer]] = {}
+
+def _checked(model: Any, name: str) -> type[NeuronLayer]:
+    if not (isinstance(model, type) and issubclass(model, NeuronLayer)):
+        raise ConfigError(
+            f"network.neuron is {name!r}, expected a subclass of switchmt_snn.spiking.neurons.NeuronLayer; "
+            "see docs/extending.md"
+        )
+    return model
+
+
+NEURONS: Registry[type[NeuronLayer]] = Registry(NetworkConfig, "network.neuron", _checked)
 """Spiking neuron models by the name that ``network.neuron`` takes."""
 
+register_neuron, neuron_model = NEURONS.register, NEURONS.find
 
-def register_neuron(name: str, model: type[NeuronLayer]) -> None:
-    """Add a model of this package under a name, which ``NetworkConfig.neuron`` lists too.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    if name in NEURONS:
-        raise ValueError(f"neuron {name!r} is registered already, expected a new name")
-    NEURONS[name] = model
-
-
-register_neuron("IF", LeakyLayer)
-register_neuron("LIF", LeakyLayer)
-register_neuron("Synaptic", SynapticLayer)
-register_neuron("ALIF", AdaptiveLayer)
-
-
-def neuron_model(name: str) -> type[NeuronLayer]:
-    """The class of a neuron model: registered, or from outside (``package.module:Class``).
-
-    Raises:
-        ConfigError: no such model, or the class from outside is no ``NeuronLayer``.
-    """
-    if is_plugin(name):
-        model = load_plugin(name, "network.neuron")
-        if not (isinstance(model, type) and issubclass(model, NeuronLayer)):
-            raise ConfigError(
-                f"network.neuron is {name!r}, expected a subclass of switchmt_snn.spiking.neurons.NeuronLayer; "
-                "see docs/extending.md"
-            )
-        return model
-    require_known("neuron", name, NEURONS, "a class from outside is named package.module:Class")
-    return NEURONS[name]
+register_neuron("IF")(LeakyLayer)
+register_neuron("LIF")(LeakyLayer)
+register_neuron("Synaptic")(SynapticLayer)
+register_neuron("ALIF")(AdaptiveLayer)
 
 
 def make_neuron_layer(config: NetworkConfig, spiking: bool) -> NeuronLayer:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from contextlib import AbstractContextManager
 from typing import Any, NoReturn
 
 import numpy as np
@@ -15,8 +16,8 @@ import torch
 from torch import Tensor
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.config.plugins import failure
-from switchmt_snn.errors import ConfigError, SwitchMTError
+from switchmt_snn.config.plugins import user_code
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.spiking.apart import apart
 from switchmt_snn.spiking.layers import NeuronNode
 from switchmt_snn.spiking.neurons.base import NeuronLayer, NeuronState
@@ -26,6 +27,8 @@ TIMESTEPS = 8
 
 CHANNELS = 5
 """Output channels of the layer that a model describes."""
+
+_SEE = "; see docs/extending.md, Neuron"
 
 
 def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) -> None:
@@ -55,10 +58,8 @@ def check_neuron(model: type[NeuronLayer], config: NetworkConfig | None = None) 
             _Played(layer, shape, config.threshold).check()
         if model.node is not NeuronLayer.node:
             _check_node(layer)
-        try:
+        with _code(model, "cannot be copied", "a layer whose attributes copy.deepcopy takes"):
             copy.deepcopy(layer)
-        except Exception as error:
-            _refuse(model, f"cannot be copied ({failure(error)})", "a layer whose attributes copy.deepcopy takes")
 
 
 def _check_class(model: type[NeuronLayer]) -> None:
@@ -74,12 +75,8 @@ def _check_class(model: type[NeuronLayer]) -> None:
 
 
 def _made(model: type[NeuronLayer], config: NetworkConfig) -> NeuronLayer:
-    try:
+    with _code(model, "cannot be made", "__init__(self, config) with super().__init__(config)"):
         layer = model(config)
-    except SwitchMTError:
-        raise
-    except Exception as error:
-        _refuse(model, f"cannot be made ({failure(error)})", "__init__(self, config) with super().__init__(config)")
     if "_parameters" not in vars(layer) or not hasattr(layer, "surrogate"):
         _refuse(model, "does not call super().__init__(config)", "it as the first line of __init__(self, config)")
     return layer
@@ -88,13 +85,9 @@ def _made(model: type[NeuronLayer], config: NetworkConfig) -> NeuronLayer:
 def _check_node(layer: NeuronLayer) -> None:
     """The description that exporters and counters read."""
     model = type(layer)
-    try:
+    with _code(model, "fails in node", "node(self, channels) -> NeuronNode, with kind and states"):
         node: Any = layer.node(CHANNELS)
         kind, states = (node.kind, node.states) if isinstance(node, NeuronNode) else (None, None)
-    except SwitchMTError:
-        raise
-    except Exception as error:
-        _refuse(model, f"fails in node ({failure(error)})", "node(self, channels) -> NeuronNode, with kind and states")
     if not isinstance(node, NeuronNode):
         _refuse(model, f"returns {_kind(node)} from node({CHANNELS})", "a dataclass derived from NeuronNode")
     if not isinstance(kind, str):
@@ -140,10 +133,8 @@ class _Played:
     def _require_run(self, first: NeuronState, spikes: Tensor, last: NeuronState) -> None:
         """``run`` is a faster form of the loop over ``step``, not another model."""
         expected = "the spikes and the last state of a loop over step: (spikes, state)"
-        try:
+        with _code(self._model, "fails in run", expected):
             result = self._layer.run(self._current, first)
-        except Exception as error:
-            _refuse(self._model, f"fails in run ({failure(error)})", expected)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[0], Tensor)):
             _refuse(self._model, f"returns {_kind(result)} from run", expected)
         self._require_state("run", result[1], last)
@@ -155,10 +146,8 @@ class _Played:
 
     def _initial(self) -> NeuronState:
         current_t = self._current[0]
-        try:
+        with _code(self._model, "fails in initial_state", "the state at rest"):
             state = self._layer.initial_state(current_t)
-        except Exception as error:
-            _refuse(self._model, f"fails in initial_state ({failure(error)})", "the state at rest")
         self._require_state("initial_state", state, None)
         return state
 
@@ -167,15 +156,10 @@ class _Played:
         arguments = {"current_t": current_t, **dict(zip(self._model.STATE, state, strict=True))}
         versions = {name: argument._version for name, argument in arguments.items()}
         before = _contents(self._layer)
-        try:
+        names = ", ".join(self._model.STATE) or "none"
+        expected = f"a step for currents of shape {tuple(current_t.shape)} and the state variables of STATE ({names})"
+        with _code(self._model, "fails in step", expected):
             result = self._layer.step(current_t, state)
-        except Exception as error:
-            names = ", ".join(self._model.STATE) or "none"
-            _refuse(
-                self._model,
-                f"fails in step ({failure(error)})",
-                f"a step for currents of shape {tuple(current_t.shape)} and the state variables of STATE ({names})",
-            )
         self._require_unchanged(before)
         for name, argument in arguments.items():
             if argument._version != versions[name]:
@@ -253,7 +237,13 @@ def _kind(value: Any) -> str:
     return f"a {type(value).__name__}" if value is not None else "None"
 
 
+def _subject(model: type[NeuronLayer]) -> str:
+    return f"the neuron {model.__module__}:{model.__qualname__}"
+
+
+def _code(model: type[NeuronLayer], seen: str, expected: str) -> AbstractContextManager[None]:
+    return user_code(f"{_subject(model)} {seen}", f"{expected}{_SEE}")
+
+
 def _refuse(model: type[NeuronLayer], seen: str, expected: str) -> NoReturn:
-    raise ConfigError(
-        f"the neuron {model.__module__}:{model.__qualname__} {seen}, expected {expected}; see docs/extending.md, Neuron"
-    )
+    raise ConfigError(f"{_subject(model)} {seen}, expected {expected}{_SEE}")
