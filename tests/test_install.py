@@ -31,16 +31,20 @@ assert any(path.name == "loihi-2018.yaml" for path in r.files("switchmt_snn.expo
 assert any(path.name == "speck.yaml" for path in r.files("switchmt_snn.export.chips.builtin").iterdir())
 templates = r.files("switchmt_snn.export.report").joinpath("templates")
 assert any(path.name.endswith(".jinja") for path in templates.iterdir())
+print("whole")
 """
 """What an install must hold, wherever Python is started."""
 
 
-def python(*words: str | Path, cwd: Path, path: Path | None = None) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+def python(*words: str | Path, cwd: Path, path: Path | None = None) -> str:
+    """Standard output of a program that ends well; without ``-O``, which would leave its assertions out."""
+    left_out = ("PYTHONPATH", "PYTHONOPTIMIZE")
+    environment = {name: value for name, value in os.environ.items() if name not in left_out}
     if path is not None:
         environment["PYTHONPATH"] = str(path)
     done = subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +74,7 @@ def test_a_wheel_holds_everything_and_nothing_else(distributions: Path, tmp_path
         tops = {name.split("/")[0] for name in archive.namelist()}
         assert tops == {"switchmt_snn", next(top for top in tops if top.endswith(".dist-info"))}
         archive.extractall(tmp_path)
-    python("-c", CHECK, tmp_path, cwd=tmp_path.parent, path=tmp_path)
+    assert python("-c", CHECK, tmp_path, cwd=tmp_path.parent, path=tmp_path) == "whole\n"
 
 
 def test_a_source_distribution_holds_real_files(distributions: Path, tmp_path: Path) -> None:
@@ -78,13 +82,13 @@ def test_a_source_distribution_holds_real_files(distributions: Path, tmp_path: P
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path, filter="data")
     (source,) = tmp_path.iterdir()
-    python("-c", CHECK, source, cwd=tmp_path, path=source)
+    assert python("-c", CHECK, source, cwd=tmp_path, path=source) == "whole\n"
 
 
 def test_the_clone_itself_is_importable(clone: Path) -> None:
     """Without any install: ``python -m benchmarks.X`` and the library example are started in the clone."""
-    python("-c", CHECK, clone, cwd=clone)
-    python("-m", "benchmarks.update_step", "--help", cwd=clone)
+    assert python("-c", CHECK, clone, cwd=clone) == "whole\n"
+    assert "usage" in python("-m", "benchmarks.update_step", "--help", cwd=clone)
 
 
 @pytest.mark.parametrize("editable", [False, True])
@@ -113,3 +117,4 @@ def test_installs_work_inside_and_outside_of_the_clone(clone: Path, tmp_path: Pa
     for folder, expected in ((tmp_path, found), (clone, str(clone))):
         done = subprocess.run([interpreter, "-c", CHECK, expected], cwd=folder, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
+        assert done.stdout == "whole\n"

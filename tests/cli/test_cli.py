@@ -249,6 +249,7 @@ def test_every_setting_of_the_config_is_an_option_of_train_and_describe() -> Non
 @pytest.mark.parametrize(("command", "renamed"), RENAMED.items())
 @pytest.mark.parametrize("joined", [True, False])
 def test_older_spellings_of_flags_still_work(command: str, renamed: dict[str, str], joined: bool, capsys) -> None:
+    assert renamed
     for old, new in renamed.items():
         code, _, err = call(capsys, command, *([f"{old}=nothing"] if joined else [old, "nothing"]))
         assert code == 2
@@ -310,4 +311,6 @@ def test_tensorboard_is_one_more_view(tmp_path: Path, capsys) -> None:
 
 
 def test_default_config_has_no_private_fields() -> None:
-    assert all(not name.startswith("_") for name in vars(ExperimentConfig()))
+    names = vars(ExperimentConfig())
+    assert {"network", "learning", "tasks"} <= names.keys()
+    assert all(not name.startswith("_") for name in names)

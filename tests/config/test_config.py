@@ -124,8 +124,11 @@ def test_differences_name_the_field() -> None:
 
 
 def test_every_field_is_documented() -> None:
-    for prefix, text, rows in field_documentation():
+    sections = list(field_documentation())
+    assert len(sections) > 5
+    for prefix, text, rows in sections:
         assert text, prefix
+        assert rows, prefix
         for key, _, _, documentation in rows:
             assert len(documentation) > 10, key
 

@@ -30,9 +30,12 @@ def test_the_page_fits_on_one_screen() -> None:
 @pytest.mark.parametrize(("files", "names"), PLACES)
 def test_a_file_defines_the_names_that_the_page_gives(files: str, names: str) -> None:
     paths = [in_package(path) for path in re.findall(r"`([^`]+)`", files)]
+    assert paths, files
     assert all(path.exists() for path in paths), files
     text = paths[0].read_text(encoding="utf-8")
-    for name in re.findall(r"`([^`]+)`", names):
+    found = re.findall(r"`([^`]+)`", names)
+    assert found, f"{files} defines no name that the page gives"
+    for name in found:
         for part in name.split("."):
             assert re.search(rf"(?:def|class|void) {part}\b", text), f"{files} does not define {name}"
 

@@ -98,6 +98,7 @@ def test_gradients_of_an_update_equal_the_one_file_gradients() -> None:
     parts = (before, actions, rewards, after, terminal)
     one_file.loss_on(tuple(torch.from_numpy(part) for part in parts), theirs, target, 1, discount=0.9).backward()
     gradients = {name: parameter.grad for name, parameter in theirs.named_parameters()}
+    assert len(gradients) == len(list(ours.parameters())) > 5
     for name, parameter in ours.named_parameters():
         for old, new in NAMES.items():
             name = name.replace(old, new)

@@ -108,8 +108,9 @@ def test_any_network_is_exported_bitwise(
     profile = "exact" if reset == "subtract" else "portable"
     written = exports(agent, None if "nir" in obstacles(fold_agent(agent), profile) else profile)
     for task in range(3):
-        for comparison in compare(agent, written, task, x):
-            assert comparison.bitwise, comparison
+        comparisons = list(compare(agent, written, task, x))
+        assert comparisons
+        assert all(comparison.bitwise for comparison in comparisons), comparisons
 
 
 @pytest.mark.slow
@@ -118,7 +119,9 @@ def test_real_weights_decide_alike(variant: str) -> None:
     agent = make_agent(**VARIANTS[variant])
     x = observations(agent, 150)
     for task in range(3):
-        for comparison in compare(agent, exports(agent, profile_of(variant)), task, x):
+        comparisons = list(compare(agent, exports(agent, profile_of(variant)), task, x))
+        assert comparisons
+        for comparison in comparisons:
             assert comparison.equal_actions_share >= 0.99, comparison
             assert comparison.decisions_with_flips <= 3, comparison
 

@@ -67,6 +67,7 @@ def test_target_moves_only_when_copied() -> None:
     before = [p.clone() for p in part.target.parameters()]
     part.update(batch(), 0)
     assert all(torch.equal(a, b) for a, b in zip(before, part.target.parameters(), strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(before, part.network.parameters(), strict=True))
     part.copy_target()
     for ours, target in zip(part.network.state_dict().values(), part.target.state_dict().values(), strict=True):
         assert torch.equal(ours, target)

@@ -123,6 +123,7 @@ def test_a_truncated_return_ends_with_its_episode() -> None:
     """Half of the episodes are truncated: 7 steps of 1 to 7 whatever ends them."""
     part = played(discount=1.0, copies=4)
     sums = [sum(range(1, step + 1)) for step in range(1, 8)]
+    assert len(part.return_scales) == 2
     for scale in part.return_scales:
         assert scale.value == pytest.approx(math.sqrt(sum(value**2 for value in sums) / 7), rel=0.05)
 

@@ -67,6 +67,7 @@ def test_an_unknown_checkpoint_is_refused(old_run: Path) -> None:
 
 def test_old_onnx_files_decide_as_the_old_run_does(old_run: Path) -> None:
     agent, exported = load_agent(old_run, device="cpu"), load_exported(old_run, "onnx")
+    assert agent.suite.names
     for task in agent.suite.names:
         k = agent.suite.index(task)
         observation = agent.suite.make(k, 1).reset(np.array([0]), np.array([5]))

@@ -49,6 +49,7 @@ def test_a_task_reads_and_trains_its_own_rows_only(method: str, quantiles: int) 
     heads = [stream.head for stream in network.streams.values()]
     q = network(x, 1)
     (q * torch.linspace(-1, 2, q.numel()).view_as(q)).sum().backward()
+    assert len(heads) == (1 if method == "DSQN" else 2)
     for head in heads:
         assert isinstance(head, TaskHeads)
         for part in (head.weight, head.bias):
