@@ -13,6 +13,7 @@ from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import TaskError
 from switchmt_snn.spiking.encodings import encoding_class
 from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.tasks.as_trained import TaskAsTrained
 from switchmt_snn.tasks.suite import TaskSuite
 
 
@@ -104,3 +105,14 @@ class Agent:
         """
         action = self.q_values(observation, task).argmax(axis=-1) + self.suite.first_action(self.suite.index(task))
         return int(action) if np.ndim(action) == 0 else action
+
+    def environment(self, task: str | int) -> TaskAsTrained:
+        """A task as training plays it: a Gymnasium environment for a loop of one's own, with what ``act`` takes.
+
+        Args:
+            task: name or index.
+
+        Raises:
+            TaskError: unknown task, or it cannot be made here.
+        """
+        return TaskAsTrained(self.suite, task)
