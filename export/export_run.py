@@ -29,6 +29,7 @@ from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAge
 from switchmt_snn.runs.evaluations import evaluation_name
 from switchmt_snn.runs.files import file_name, json_text, write_atomically, written_whole
 from switchmt_snn.runs.folder import RunFolder, latest_run
+from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
 from switchmt_snn.tasks.registry import make_suite
@@ -270,7 +271,9 @@ def evaluate_exported(
     compared = ComparedAgent(played, agent)
     settings = replace(config.evaluation, **protocol)
     tasks = None if task is None else (suite.names[suite.index(task)],)
-    evaluation = evaluate_agent(compared, EvaluationProtocol.of(settings, config.tasks), tasks)
+    conditions = EvaluationProtocol.of(settings, config.tasks)
+    known = RandomPlay(folder.path, config, suite, conditions)
+    evaluation = evaluate_agent(compared, conditions, tasks, random_play=known)
     decisions, equal = (sum(column) for column in zip(*compared.compared, strict=True))
     share = equal / decisions
     facts = {"runtime": runtime, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}

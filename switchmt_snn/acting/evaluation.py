@@ -51,6 +51,16 @@ class DecisionMaker(Protocol):
         """
 
 
+class KnownEpisodes(Protocol):
+    """Episodes of random play that were played before."""
+
+    def read(self, task: str) -> list[EpisodeScore] | None:
+        """All episodes of a task, in order; None if they are not known."""
+
+    def keep(self, task: str, episodes: list[EpisodeScore]) -> None:
+        """Take the episodes of a task that were played now."""
+
+
 @dataclass(frozen=True)
 class EvaluationProtocol:
     """Everything that a score depends on, apart from the agent; printed with every score.
@@ -162,6 +172,7 @@ def evaluate_agent(
     tasks: tuple[str, ...] | None = None,
     note: Callable[[str], None] | None = None,
     stop: Callable[[], bool] | None = None,
+    random_play: KnownEpisodes | None = None,
 ) -> Evaluation:
     """Play ``protocol.episodes`` episodes of each task with the agent and with the random policy.
 
@@ -175,6 +186,7 @@ def evaluate_agent(
         tasks: names; None means all.
         note: receives what the user should know meanwhile: episodes that do not end.
         stop: asked at every step; the evaluation ends when it says so.
+        random_play: episodes of the random policy that are known under this protocol; None plays them.
 
     Raises:
         TaskError: a task is not one of the agent's, or its environment fails.
@@ -182,11 +194,14 @@ def evaluate_agent(
     """
     suite = agent.suite
     names = tasks or suite.names
+    read = {} if random_play is None else {name: random_play.read(name) for name in names}
+    known = [episode for episodes in read.values() for episode in episodes or ()]
     groups = [
         (policy, suite.index(name), range(first, min(first + protocol.num_envs, protocol.episodes)))
         for policy in ("agent", "random")
         for name in names
         for first in range(0, protocol.episodes, protocol.num_envs)
+        if policy == "agent" or read.get(name) is None
     ]
 
     def go_on() -> None:
@@ -206,12 +221,18 @@ def evaluate_agent(
         )
 
     with parts(in_threads=suite.thread_safe) as work:
-        episodes = [episode for group in work.map(played, groups) for episode in group]
-    rows = []
-    for policy in ("agent", "random"):
+        now = [episode for group in work.map(played, groups) for episode in group]
+    of = {
+        (policy, name): [e for e in (*now, *known) if (e.policy, e.task) == (policy, name)]
+        for policy in ("agent", "random")
+        for name in names
+    }
+    if random_play is not None:
         for name in names:
-            rows.append(summarize(suite, [e for e in episodes if e.policy == policy and e.task == name]))
-    return Evaluation(protocol, agent.step, tuple(rows), tuple(episodes))
+            if read[name] is None:
+                random_play.keep(name, of["random", name])
+    rows = [summarize(suite, episodes) for episodes in of.values()]
+    return Evaluation(protocol, agent.step, tuple(rows), tuple(e for episodes in of.values() for e in episodes))
 
 
 @dataclass(frozen=True)

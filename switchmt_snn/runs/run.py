@@ -28,6 +28,7 @@ from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run, latest_run
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.plan import decide, plan
+from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.signals import stop_requests
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite, register_suite
@@ -315,7 +316,8 @@ class _Driver:
         agent = Agent(training.learner.network, training.suite, self.config, training.learner.device, training.steps)
         protocol = EvaluationProtocol.of(settings, self.config.tasks)
         self._note(f"evaluating: {protocol}")
-        evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop)
+        known = RandomPlay(self.folder.path, self.config, training.suite, protocol)
+        evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop, random_play=known)
         self.folder.save_evaluation(evaluation)
         self.best.at_evaluation(evaluation, agent.network)
         return evaluation
@@ -340,6 +342,17 @@ def load_agent(
     Raises:
         RunFolderError: no such run.
         CheckpointError: no whole checkpoint.
+
+    Example:
+        A loop of one's own; ``Agent.environment`` plays a task exactly as training does.
+
+        >>> from switchmt_snn import load_agent
+        >>> agent = load_agent("runs/mine")  # the run of train's example
+        >>> env = agent.environment("CartPole-v1")
+        >>> observation, _ = env.reset(seed=1)
+        >>> terminated = truncated = False
+        >>> while not (terminated or truncated):
+        ...     observation, reward, terminated, truncated, _ = env.step(agent.act(observation, "CartPole-v1"))
     """
     if threads is not None:
         torch.set_num_threads(threads)
@@ -378,7 +391,9 @@ def evaluate(
     agent = load_agent(folder.path, checkpoint)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
-    evaluation = evaluate_agent(agent, EvaluationProtocol.of(settings, agent.config.tasks), tasks, note)
+    conditions = EvaluationProtocol.of(settings, agent.config.tasks)
+    known = RandomPlay(folder.path, agent.config, agent.suite, conditions) if save else None
+    evaluation = evaluate_agent(agent, conditions, tasks, note, random_play=known)
     if save:
         folder.save_evaluation(evaluation)
     return evaluation

@@ -146,6 +146,7 @@ class AtariSuite(Suite):
             references={name: self.references[name] for name in config.names if name in self.references},
             make=make,
             thread_safe=True,
+            versioned=True,
         )
 
 

@@ -79,6 +79,7 @@ def require_tasks(tasks: Any, config: TasksConfig) -> TaskSuite:
             f"none, or one whole number for each of {count} tasks",
         ),
         ("thread_safe", _truth, "True or False"),
+        ("versioned", _truth, "True or False"),
         ("make", callable, "a function make(task, num_envs) -> the copies of a task"),
     )
     for name, holds, expected in fields:

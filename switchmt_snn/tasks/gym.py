@@ -57,7 +57,7 @@ class GymSuite(Suite):
             for name, env in zip(names, probes, strict=True)
         ]
         first_actions = tuple(first_action(env) for env in probes)
-        thread_safe = not any(is_outside(env) for env in probes)
+        is_gymnasiums = not any(is_outside(env) for env in probes)
         for env in probes:
             env.close()
         _require_one_kind(names, layouts)
@@ -81,7 +81,8 @@ class GymSuite(Suite):
             references={},
             make=make,
             first_actions=first_actions,
-            thread_safe=thread_safe,
+            thread_safe=is_gymnasiums,
+            versioned=is_gymnasiums,
         )
 
 

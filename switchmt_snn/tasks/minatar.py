@@ -77,6 +77,7 @@ class MinAtarSuite(Suite):
             references={},
             make=make,
             thread_safe=True,
+            versioned=True,
         )
 
 

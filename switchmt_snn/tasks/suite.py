@@ -93,6 +93,8 @@ class TaskSuite:
             empty means 0 in every task. ``make``'s environments take actions from 0; ``Agent.act`` and exports name the
             environment's.
         thread_safe: whether copies may be stepped in several threads at a time; evaluations then use every core.
+        versioned: whether the suite's ``packages``, ``files`` and this package hold all code that decides an episode.
+            Random play is then kept beside a run and not played again. Default: no.
     """
 
     names: tuple[str, ...]
@@ -108,6 +110,7 @@ class TaskSuite:
     """``make(task, num_envs)`` builds the environments of a task."""
     first_actions: tuple[int, ...] = ()
     thread_safe: bool = False
+    versioned: bool = False
 
     def first_action(self, task: int) -> int:
         """The number by which a task's environment calls action 0."""

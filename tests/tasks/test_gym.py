@@ -220,8 +220,10 @@ def test_the_global_generators_of_everybody_else_stay_as_they_are() -> None:
     assert (random.random(), np.random.rand(), np.random.randn()) == expected
 
 
-def test_only_environments_of_gymnasium_itself_are_played_in_several_threads() -> None:
-    assert make_suite(TasksConfig(suite="gym", names=("CartPole-v1",))).thread_safe
-    assert not suite_of("Plain").thread_safe
+def test_only_environments_of_gymnasium_itself_are_played_in_several_threads_and_kept() -> None:
+    """Random play of code that no version names is played again for each evaluation."""
+    suite = make_suite(TasksConfig(suite="gym", names=("CartPole-v1",)))
+    assert (suite.thread_safe, suite.versioned) == (True, True)
+    assert (suite_of("Plain").thread_safe, suite_of("Plain").versioned) == (False, False)
     wrapped = TasksConfig(suite="gym", names=("CartPole-v1",), wrappers=(f"{MODULE}:Halves",))
-    assert not make_suite(wrapped).thread_safe
+    assert (make_suite(wrapped).thread_safe, make_suite(wrapped).versioned) == (False, False)
