@@ -105,7 +105,7 @@ def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
         _import(name, module)
     expected = "a Gymnasium environment with observation_space and action_space"
     with user_code(f"task {name!r} cannot be made", expected, TaskError):
-        env = _registered(name, env_id if colon else name)
+        env = _registered(name, env_id)
     for wrapper in wrappers:
         env = _wrapped(name, env, wrapper)
     return env
