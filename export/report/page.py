@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
+
+from switchmt_snn.drawing.numbers import digits
+from switchmt_snn.drawing.page import FILTERS as PAGE_FILTERS
+from switchmt_snn.drawing.page import page_environment
 
 Frames = Sequence[npt.NDArray[Any]]
 """Frames of each task's stretch of play, ``[n, *frame_shape]``."""
@@ -32,32 +35,12 @@ def render_report(runs: list[dict[str, Any]], frames: Sequence[Frames], command:
         frames: for each run, the frames of each task's stretch of play (empty without).
         command: what made it.
     """
-    environment = Environment(
-        loader=PackageLoader("switchmt_snn.export.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = page_environment("switchmt_snn.export.report")
     environment.filters |= FILTERS
     environment.globals |= FILTERS | {"colours": _LAYER_COLOURS, "raster": _raster, "picture": _picture}
     return environment.get_template("report.html.jinja").render(
         runs=list(zip(runs, frames, strict=True)), command=command
     )
-
-
-def whole(value: float) -> str:
-    """A count."""
-    return f"{value:,.0f}"
-
-
-def digits(value: float) -> str:
-    """Three significant digits, without an exponent from 0.001 on."""
-    if value == 0:
-        return "0"
-    if abs(value) >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.3g}" if abs(value) >= 1e-3 else f"{value:.1e}"
 
 
 def microjoule(value_pj: float) -> str:
@@ -75,17 +58,7 @@ def thousandth(value: float) -> str:
     return digits(value / 1e3)
 
 
-def percent(value: float) -> str:
-    """A share."""
-    return f"{value:.2%}" if value < 1 else "100%"
-
-
-def two(value: float) -> str:
-    """A ratio."""
-    return f"{value:.2f}"
-
-
-FILTERS = {filter.__name__: filter for filter in (whole, digits, microjoule, millijoule, thousandth, percent, two)}
+FILTERS = PAGE_FILTERS | {filter.__name__: filter for filter in (microjoule, millijoule, thousandth)}
 
 
 def _raster(layer: dict[str, Any], timesteps: int) -> str:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 
 from switchmt_snn import __version__
-from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, profile, train
+from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, profile, report, runs, train
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.machine.program import runnable
 from switchmt_snn.viewing.output import speak_any_encoding
@@ -18,6 +18,8 @@ usage: switchmt-snn COMMAND [options]
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
+  report [RUN ...]    one HTML page: curves, switches, speed, layers, scores; of several runs a comparison
+  runs [FOLDER]       the run folders with method, tasks, steps, status, scores and size (default: runs/)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   check-env ID ...    what an environment is taken for, how it plays, and why training would refuse it
   doctor              versions, games and devices of this installation
@@ -31,6 +33,8 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "evaluate": evaluate.command,
     "export": export.command,
     "profile": profile.command,
+    "report": report.command,
+    "runs": runs.command,
     "describe": describe.command,
     "check-env": check_env.command,
     "doctor": doctor.command,

@@ -19,6 +19,8 @@ ARGUMENTS = {
     "evaluate": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "profile": ("RUN", "run folders, or NIR files (default: the run under runs/ that was begun last)"),
+    "report": ("RUN", "run folders; several are compared (default: the run under runs/ that was begun last)"),
+    "runs": ("FOLDER", "a folder with run folders, or one run folder (default: runs/)"),
     "check-env": ("ID", "names of environments; several must fit one network"),
     "doctor": ("", ""),
 }

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from switchmt_snn.cli.parsing import parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
+from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.machine.program import program, runnable
 from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
@@ -71,6 +72,8 @@ def command(argv: list[str]) -> int:
     elif result.evaluation is not None:
         console.print(evaluation_table(result.evaluation))
         _say_what_next(console, config, result.path, result.step)
+    if result.status != "already_finished":
+        _write_report(console, result.path)
     if not options.json:
         print(result.path)
     return 130 if result.status == "stopped" else 0
@@ -103,6 +106,18 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path, step:
     ]
     for line in lines:
         console.print(runnable(line), highlight=False, soft_wrap=True)
+
+
+def _write_report(console: Console, path: Path) -> None:
+    """The run's page; a run that trained well does not fail because its page cannot be written."""
+    from switchmt_snn.viewing.report.page import write_report
+
+    try:
+        page = write_report([path])
+    except SwitchMTError as error:
+        console.print(f"no report: {error}", highlight=False, soft_wrap=True)
+    else:
+        console.print(f"report: {page}", highlight=False, soft_wrap=True)
 
 
 def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:

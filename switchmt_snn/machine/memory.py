@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import resource
+import sys
 from pathlib import Path
 
 import psutil
+import torch
 
 GIB = 1024**3
 
@@ -18,3 +21,14 @@ def available_bytes() -> int:
         used = int(Path("/sys/fs/cgroup/memory.current").read_text())
         available = min(available, limit - used)
     return available
+
+
+def peak_bytes() -> int:
+    """The largest memory that this process has had so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # macOS counts bytes, Linux KiB
+
+
+def peak_device_bytes() -> int | None:
+    """The largest memory that tensors on a GPU have had so far; None if this process uses none."""
+    return int(torch.cuda.max_memory_allocated()) if torch.cuda.is_initialized() else None

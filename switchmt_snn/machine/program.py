@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 NAME = "switchmt-snn"
-_COMMAND = re.compile(rf"(?<![\w/.-]){NAME} (?=(?:train|evaluate|export|profile|describe|doctor|check-env)\b)")
+_COMMAND = re.compile(
+    rf"(?<![\w/.-]){NAME} (?=(?:train|evaluate|export|profile|report|runs|describe|doctor|check-env)\b)"
+)
 
 
 def program() -> str:

@@ -82,6 +82,14 @@ class Evaluations:
                 }
         return found
 
+    def all(self) -> list[dict[str, Any]]:
+        """Every stored summary (``step``, ``protocol``, ``tasks``) with its ``file``, by step, then by name.
+
+        Raises:
+            RunFolderError: a file is no evaluation.
+        """
+        return [{**_read(path), "file": path.name} for path in sorted(self.folder.glob("step-*.json"))]
+
     def _at(self, step: int) -> list[dict[str, Any]]:
         """The stored summaries of a step, in order of their names."""
         return [_read(path) for path in sorted(self.folder.glob(f"{_step_name(step)}_*.json"))]
@@ -94,7 +102,11 @@ def _step_name(step: int) -> str:
 def _read(path: Path) -> dict[str, Any]:
     try:
         stored = dict(json.loads(path.read_bytes()))
-        stored = {"protocol": dict(stored["protocol"]), "tasks": [dict(row) for row in stored["tasks"]]}
+        stored = {
+            "step": int(stored["step"]),
+            "protocol": dict(stored["protocol"]),
+            "tasks": [dict(row) for row in stored["tasks"]],
+        }
         for row in stored["tasks"]:
             row["mean"] = math.nan if row["mean"] is None else float(row["mean"])  # JSON has no NaN
             _ = row["policy"], row["task"], row["episodes"], float(row["mean_length_steps"])

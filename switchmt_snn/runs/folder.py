@@ -26,6 +26,8 @@ from switchmt_snn.runs.files import json_text, write_atomically
 
 RUNS = Path("runs")
 LOCK = {"run.lock"}
+LOCK_TIMEOUT_S = 0.5
+"""A reader that asks whether a run is going on holds its lock for a moment (``RunFolder.in_use``)."""
 
 
 def claim_new_run(name: str) -> RunFolder:
@@ -190,7 +192,7 @@ class RunFolder:
         lock = filelock.FileLock(self.path / "run.lock")
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            lock.acquire(timeout=0)
+            lock.acquire(timeout=LOCK_TIMEOUT_S)
         except filelock.Timeout as error:
             raise RunFolderError(
                 f"{self.path} is in use by another process, expected a free run folder; wait for it, or name another "
@@ -199,6 +201,22 @@ class RunFolder:
         except OSError as error:
             raise RunFolderError(_unwritable(self.path, error)) from error
         return lock
+
+    @property
+    def in_use(self) -> bool:
+        """Whether another process trains here."""
+        path = self.path / "run.lock"
+        if not path.is_file():
+            return False
+        lock = filelock.FileLock(path)
+        try:
+            lock.acquire(timeout=0)
+        except filelock.Timeout:
+            return True
+        except OSError:  # a folder of somebody else's
+            return False
+        lock.release()
+        return False
 
     def save_evaluation(self, evaluation: Evaluation) -> Path:
         """Write a summary (JSON) and the episodes (CSV) of an evaluation; returns the CSV's path."""

@@ -13,6 +13,7 @@ from switchmt_snn.config.numbers import exact
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDecided
 from switchmt_snn.learning.switching import DECISION_COLUMNS, SwitchTo
+from switchmt_snn.machine.memory import peak_bytes, peak_device_bytes
 from switchmt_snn.runs.files import json_text
 
 EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncated", "epsilon", "updates", "wall_s")
@@ -65,7 +66,9 @@ class RunLogs:
         elif isinstance(event, SwitchDecided):
             self._tables["switches.csv"].writerow(self._switch_row(event))
         elif isinstance(event, Measured):
-            self._files["metrics.jsonl"].write(json_text(self._metrics_row(event) | {"wall_s": wall_s}) + "\n")
+            taken = {"peak_memory_bytes": peak_bytes(), "peak_device_memory_bytes": peak_device_bytes()}
+            row = self._metrics_row(event) | {"wall_s": wall_s} | taken
+            self._files["metrics.jsonl"].write(json_text(row) + "\n")
 
     def _episode_row(self, event: EpisodeEnded) -> dict[str, Any]:
         return {

@@ -10,6 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from switchmt_snn.drawing.numbers import duration
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.switching import SwitchTo
 from switchmt_snn.learning.training import Training
@@ -176,17 +177,6 @@ class Speed:
         then_s, before = self._seen[0]
         self._seen.append((now_s, steps))
         return (steps - before) / (now_s - then_s) if now_s > then_s else 0.0
-
-
-def duration(seconds: float) -> str:
-    """Hours, minutes and seconds; days in front if there are any.
-
-    >>> duration(3_725.4), duration(428_400)
-    ('01:02:05', '4 d 23:00:00')
-    """
-    days, rest = divmod(max(0, int(seconds)), 86_400)
-    clock = f"{rest // 3600:02}:{rest // 60 % 60:02}:{rest % 60:02}"
-    return f"{days} d {clock}" if days else clock
 
 
 def _mean(values: deque[float]) -> str:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from rich import box
 from rich.table import Table
 
 from switchmt_snn.acting.evaluation import Evaluation, TaskScore
+from switchmt_snn.drawing.numbers import bytes_of, compact, duration
 from switchmt_snn.machine.memory import GIB
 from switchmt_snn.runs.description import MethodDescription
+from switchmt_snn.runs.listing import RunSummary
 from switchmt_snn.tasks.registry import find_suite
 from switchmt_snn.tasks.suite import Suite
 
@@ -86,6 +89,32 @@ def _score_cells(row: TaskScore) -> list[str]:
         "" if row.mean_q is None else f"{row.mean_q:.3f}",
         str(row.episodes),
     ]
+
+
+def runs_table(runs: Sequence[RunSummary]) -> Table:
+    """Run folders, one a row; ``runs`` is not empty."""
+    table = _table(
+        f"Runs in {runs[0].path.parent}",
+        "scores: mean of the newest evaluation; * of the newest training returns, where there is no evaluation",
+    )
+    _add_columns(table, ("run", "method", "status"), ("steps", "time", "size"))
+    table.add_column("scores", overflow="fold")
+    for run in runs:
+        scores = "\n".join(
+            f"{score.task} {score.mean:.4g}{'*' if score.of == 'training' else ''}" for score in run.scores
+        )
+        left_out = [task for task in run.tasks if task not in {score.task for score in run.scores}]
+        done = f"{run.steps / run.total_steps:.0%}" if run.status != "finished" else ""
+        table.add_row(
+            run.path.name,
+            run.method,
+            f"{run.status} {done}".strip(),
+            compact(run.steps),
+            duration(run.seconds),
+            bytes_of(run.bytes),
+            "\n".join([scores, *left_out]).strip(),
+        )
+    return table
 
 
 def parity_table(parity: dict[str, Any]) -> Table:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from switchmt_snn.viewing.progress import Speed, duration
+from switchmt_snn.drawing.numbers import duration
+from switchmt_snn.viewing.progress import Speed
 
 
 @pytest.mark.parametrize(

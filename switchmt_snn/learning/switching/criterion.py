@@ -74,6 +74,19 @@ class Verdict:
     summary: str = ""
 
 
+@dataclass(frozen=True)
+class Deciding:
+    """A number that decides, for charts of a run.
+
+    Attributes:
+        number: the column of switches.csv.
+        bound: columns whose product it is compared with; empty for none.
+    """
+
+    number: str
+    bound: tuple[str, ...] = ()
+
+
 class Criterion(Stateful):
     """Decides at each episode's end whether learning on the current task has levelled off.
 
@@ -83,11 +96,13 @@ class Criterion(Stateful):
 
     Attributes:
         columns: names of the numbers that it reports in ``Verdict.measured``; they are columns of switches.csv.
+        deciding: which of them decide; charts show these, or all of ``columns`` if it is empty.
         judges_learning: whether it concludes from what was learned. Then it sees no episode of a visit that ended
             before the visit's first update (``switching.judge_learning``). False for a rule that only counts.
     """
 
     columns: ClassVar[tuple[str, ...]]
+    deciding: ClassVar[tuple[Deciding, ...]] = ()
     judges_learning: ClassVar[bool] = True
 
     def __init__(self, config: SwitchingConfig) -> None:
@@ -134,6 +149,13 @@ def check_criterion(criterion: Any, policy: str) -> type[Criterion]:
             )
     if not isinstance(criterion.judges_learning, bool):
         raise ConfigError(f"{seen}, whose judges_learning is {criterion.judges_learning!r}, expected True or False")
+    known = (*columns, "episodes_in_visit", "steps_in_visit")
+    deciding = criterion.deciding
+    if not (isinstance(deciding, tuple) and all(isinstance(one, Deciding) for one in deciding)):
+        raise ConfigError(f"{seen}, whose deciding is {deciding!r}, expected a tuple of Deciding(number, bound)")
+    for name in (name for one in deciding for name in (one.number, *one.bound)):
+        if name not in known:
+            raise ConfigError(f"{seen}, whose deciding names {name!r}, expected one of {', '.join(known)}")
     for column in columns:
         if column in DECISION_COLUMNS or not column.isidentifier() or columns.count(column) > 1:
             raise ConfigError(

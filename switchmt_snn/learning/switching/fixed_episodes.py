@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from switchmt_snn.config import SwitchingConfig
-from switchmt_snn.learning.switching.criterion import Criterion, EpisodeRecord, Verdict, register_criterion
+from switchmt_snn.learning.switching.criterion import Criterion, Deciding, EpisodeRecord, Verdict, register_criterion
 
 
 @register_criterion("fixed_episodes")
@@ -11,6 +11,7 @@ class FixedEpisodes(Criterion):
     """Leave after a number of episodes (MTSpark and the baselines: 25)."""
 
     columns = ("visit_episodes",)
+    deciding = (Deciding("episodes_in_visit", ("visit_episodes",)),)
     judges_learning = False
     DERIVED = ("episodes",)
 

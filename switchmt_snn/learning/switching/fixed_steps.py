@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from switchmt_snn.config import SwitchingConfig
-from switchmt_snn.learning.switching.criterion import Criterion, EpisodeRecord, Verdict, register_criterion
+from switchmt_snn.learning.switching.criterion import Criterion, Deciding, EpisodeRecord, Verdict, register_criterion
 
 
 @register_criterion("fixed_steps")
@@ -11,6 +11,7 @@ class FixedSteps(Criterion):
     """Leave at the first episode end after a number of steps."""
 
     columns = ("visit_steps",)
+    deciding = (Deciding("steps_in_visit", ("visit_steps",)),)
     judges_learning = False
     DERIVED = ("steps",)
 

@@ -13,6 +13,7 @@ class ParameterAndReward(Criterion):
     """The abstract's claim: leave when both the parameters and the rewards have levelled off."""
 
     columns = (*ParameterChange.columns, *RewardPlateau.columns, "parameter_says_leave", "reward_says_leave")
+    deciding = (*ParameterChange.deciding, *RewardPlateau.deciding)
     SAVED = ("parameter", "reward")
 
     def __init__(self, config: SwitchingConfig) -> None:

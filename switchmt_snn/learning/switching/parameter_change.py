@@ -9,7 +9,7 @@ from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
 from switchmt_snn.errors import require_saved
-from switchmt_snn.learning.switching.criterion import Criterion, EpisodeRecord, Verdict, register_criterion
+from switchmt_snn.learning.switching.criterion import Criterion, Deciding, EpisodeRecord, Verdict, register_criterion
 
 
 @register_criterion("parameter_change")
@@ -22,6 +22,7 @@ class ParameterChange(Criterion):
     """
 
     columns = ("parameter_change", "change_threshold", "snapshots")
+    deciding = (Deciding("parameter_change", ("change_threshold",)),)
     SAVED = ("history", "updates")
     DERIVED = ("window_episodes", "threshold", "always")
 

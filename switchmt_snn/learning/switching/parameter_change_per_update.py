@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
-from switchmt_snn.learning.switching.criterion import Criterion, EpisodeRecord, Verdict, register_criterion
+from switchmt_snn.learning.switching.criterion import Criterion, Deciding, EpisodeRecord, Verdict, register_criterion
 from switchmt_snn.learning.switching.parameter_change import relative_change
 
 
@@ -25,6 +25,7 @@ class ParameterChangePerUpdate(Criterion):
         "largest_change_per_update",
         "change_rate_fraction",
     )
+    deciding = (Deciding("change_per_update", ("change_rate_fraction", "largest_change_per_update")),)
     SAVED = ("history", "updates", "largest")
     DERIVED = ("window_episodes", "fraction")
 

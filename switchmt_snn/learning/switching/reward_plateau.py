@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from switchmt_snn.config import SwitchingConfig
-from switchmt_snn.learning.switching.criterion import Criterion, EpisodeRecord, Verdict, register_criterion
+from switchmt_snn.learning.switching.criterion import Criterion, Deciding, EpisodeRecord, Verdict, register_criterion
 
 
 @register_criterion("reward_plateau")
@@ -19,6 +19,7 @@ class RewardPlateau(Criterion):
     """
 
     columns = ("returns", "reward_slope", "reward_t", "plateau_t", "flat_episodes")
+    deciding = (Deciding("reward_t", ("plateau_t",)),)
     SAVED = ("returns", "flat_episodes")
     DERIVED = ("window_episodes", "t_threshold", "patience_episodes")
 

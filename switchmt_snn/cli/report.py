@@ -1,0 +1,33 @@
+"""``switchmt-snn report``: the page of a run, or of several runs side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from switchmt_snn.cli.parsing import parse, split
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Write one HTML page about a run (curves, switches, speed, layers, scores), or about several side by side."""
+
+    out: Path | None = None
+    """Folder to write to. Default: the run's own; with several runs the first one's."""
+    figures: bool = False
+    """Also write every figure as SVG, PNG and CSV, to the folder figures (or comparison_figures)."""
+    json: bool = False
+    """Print the page's numbers as JSON."""
+
+
+def command(argv: list[str]) -> int:
+    """Run the command; returns its exit code."""
+    names, rest = split(ReportOptions, argv, "report", ReportOptions())
+    options = parse(ReportOptions, rest, "report", ReportOptions())
+    from switchmt_snn.runs.folder import latest_run
+    from switchmt_snn.viewing.report.page import write_report
+
+    runs = [Path(name) for name in names] or [latest_run()]
+    page = write_report(runs, options.out, options.figures)
+    print(page.with_suffix(".json").read_text("utf-8") if options.json else page)
+    return 0

@@ -1,0 +1,205 @@
+"""A run's logs read back: episodes, decisions and measurements, also while the run goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+from switchmt_snn.errors import RunFolderError
+from switchmt_snn.learning.events import EpisodeEnded, LayerHealth, Measured
+from switchmt_snn.learning.switching import DECISION_COLUMNS
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A row of switches.csv; ``numbers`` are the columns that hold a number, the policy's own among them."""
+
+    step: int
+    visit: int
+    task: str
+    switches: bool
+    next_task: str
+    reason: str
+    numbers: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Clocked:
+    """A moment of the run: agent steps, and seconds since the call began in which they were made."""
+
+    step: int
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class History:
+    """The logs of a run.
+
+    Attributes:
+        task_names: by task index.
+        episodes: in order of their ends.
+        decisions: empty if there is no switches.csv.
+        measured: rows of metrics.jsonl.
+        clock: wall time of episodes and measurements, in order of steps.
+        peak_memory_bytes: largest memory of the process and of its device that a row names; None if none does.
+    """
+
+    task_names: tuple[str, ...]
+    episodes: tuple[EpisodeEnded, ...]
+    decisions: tuple[Decision, ...]
+    measured: tuple[Measured, ...]
+    clock: tuple[Clocked, ...]
+    peak_memory_bytes: dict[str, int | None]
+
+    @property
+    def last_step(self) -> int:
+        """The newest step that a log names; 0 if none does."""
+        steps = [rows[-1].step for rows in (self.episodes, self.decisions, self.measured) if rows]
+        return max(steps, default=0)
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps at the newest line that counts them."""
+        counts = [rows[-1].updates for rows in (self.episodes, self.measured) if rows]
+        return max(counts, default=0)
+
+    @cached_property
+    def calls(self) -> tuple[tuple[Clocked, ...], ...]:
+        """The clock of each call of ``train``: it starts anew when a run is continued."""
+        calls: list[list[Clocked]] = [list(self.clock[:1])]
+        for before, now in pairwise(self.clock):
+            if now.wall_s < before.wall_s:
+                calls.append([])
+            calls[-1].append(now)
+        return tuple(tuple(call) for call in calls if call)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds of all calls, each up to its last line."""
+        return sum(call[-1].wall_s for call in self.calls)
+
+
+def read_history(folder: Path, task_names: tuple[str, ...]) -> History:
+    """Read the logs in a run folder; a file that is missing has no rows. A last line without its end is being written.
+
+    Raises:
+        RunFolderError: naming the file and the line that cannot be read.
+    """
+
+    def episode(row: dict[str, str]) -> tuple[EpisodeEnded, Clocked]:
+        ended = EpisodeEnded(
+            step=int(row["step"]),
+            task=task_names.index(row["task"]),
+            episode=int(row["episode"]),
+            episode_return=float(row["return"]),
+            length_steps=int(row["length_steps"]),
+            truncated=row["truncated"] == "1",
+            epsilon=float(row["epsilon"]),
+            updates=int(row["updates"]),
+        )
+        return ended, Clocked(ended.step, float(row["wall_s"]))
+
+    def measurement(line: str) -> tuple[Measured, Clocked, dict[str, Any]]:
+        row = dict(json.loads(line))
+        measured = Measured(
+            step=int(row["step"]),
+            task=task_names.index(row["task"]),
+            updates=int(row["updates"]),
+            loss=_number(row["loss"]),
+            q=_number(row["q"]),
+            steps_by_task=tuple(int(row["steps_by_task"].get(task, 0)) for task in task_names),
+            layers={name: _health(layer) for name, layer in row["layers"].items()},
+        )
+        return measured, Clocked(measured.step, float(row["wall_s"])), row
+
+    episodes = _table(folder / "episodes.csv", episode)
+    decisions = _table(folder / "switches.csv", _decision)
+    rows = list(_parsed(folder / "metrics.jsonl", enumerate(_whole_lines(folder / "metrics.jsonl"), 1), measurement))
+    clock = sorted([one for _, one in episodes] + [one for _, one, _ in rows], key=lambda one: one.step)
+    peaks = {
+        name: max((int(row[key]) for _, _, row in rows if row.get(key) is not None), default=None)
+        for name, key in (("process", "peak_memory_bytes"), ("device", "peak_device_memory_bytes"))
+    }
+    return History(
+        task_names=task_names,
+        episodes=tuple(one for one, _ in episodes),
+        decisions=tuple(decisions),
+        measured=tuple(one for one, _, _ in rows),
+        clock=tuple(clock),
+        peak_memory_bytes=peaks,
+    )
+
+
+def _decision(row: dict[str, str]) -> Decision:
+    texts = ("step", "visit", "task", "decision", "next_task", "reason")
+    numbers = {name: float(value) for name, value in row.items() if name not in texts and value}
+    if row["decision"] not in ("stay", "switch"):
+        raise ValueError(f"decision is {row['decision']!r}")
+    return Decision(
+        step=int(row["step"]),
+        visit=int(row["visit"]),
+        task=row["task"],
+        switches=row["decision"] == "switch",
+        next_task=row["next_task"],
+        reason=row["reason"],
+        numbers={name: value for name, value in numbers.items() if math.isfinite(value)},
+    )
+
+
+def policy_columns(history: History) -> tuple[str, ...]:
+    """Numbers of the switching policy that the run's decisions hold, beside those that every run has."""
+    names = dict.fromkeys(name for decision in history.decisions for name in decision.numbers)
+    return tuple(name for name in names if name not in DECISION_COLUMNS)
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _health(layer: dict[str, Any]) -> LayerHealth:
+    return LayerHealth(
+        *(math.nan if layer[key] is None else float(layer[key]) for key in ("rate", "dead", "saturated"))
+    )
+
+
+def _table(path: Path, parse: Callable[[dict[str, str]], _T]) -> list[_T]:
+    lines = _whole_lines(path)
+    header = next(csv.reader(lines[:1]), [])
+
+    def numbered() -> Iterator[tuple[int, dict[str, str]]]:
+        reader = csv.DictReader(lines[1:], header)
+        for row in reader:
+            yield reader.line_num + 1, row
+
+    return list(_parsed(path, numbered(), parse))
+
+
+def _parsed(path: Path, rows: Iterator[tuple[int, Any]], parse: Callable[[Any], _T]) -> Iterator[_T]:
+    for number, row in rows:
+        try:
+            yield parse(row)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RunFolderError(
+                f"{path} line {number} cannot be read ({error!s:.80}), expected a line as training writes it; restore "
+                "the file from a copy, or delete the line"
+            ) from error
+
+
+def _whole_lines(path: Path) -> Sequence[str]:
+    """The lines that have their end."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return []
+    except UnicodeDecodeError as error:
+        raise RunFolderError(f"{path} is no text, expected a log of a run; restore it from a copy") from error
+    return text[: text.rfind("\n") + 1].splitlines()

@@ -1,0 +1,99 @@
+"""From facts to files: ``report.html`` with ``report.json``, ``comparison.html`` with ``comparison.json``, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from switchmt_snn.drawing.chart import WIDE, Chart, Timeline, picture_of, visible_references
+from switchmt_snn.drawing.files import figure_files
+from switchmt_snn.drawing.marks import series_colour
+from switchmt_snn.drawing.numbers import compact, digits, duration
+from switchmt_snn.drawing.page import page_environment
+from switchmt_snn.drawing.svg import inline_svg
+from switchmt_snn.errors import RunFolderError
+from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.viewing.report.comparison import comparison_facts, comparison_figures, grouped
+from switchmt_snn.viewing.report.facts import figures_of, run_facts
+from switchmt_snn.viewing.report.sources import read_sources
+
+
+def write_report(runs: Sequence[str | Path], out: str | Path | None = None, figures: bool = False) -> Path:
+    """Write the page of a run, or of several runs side by side.
+
+    Args:
+        runs: run folders, at least one.
+        out: folder to write to; None is the run's own, of several the first one's.
+        figures: also write every figure as SVG, PNG (by Pillow) and CSV.
+
+    Returns:
+        The path of ``report.html``, or with several runs of ``comparison.html``. A JSON file beside it holds every
+        number that the page shows.
+
+    Raises:
+        SwitchMTError: a folder is no run, or a file of it cannot be read.
+
+    Example:
+        >>> from switchmt_snn.viewing.report.page import write_report
+        >>> write_report(["runs/mine"])  # doctest: +SKIP
+        PosixPath('runs/mine/report.html')
+    """
+    paths = list(dict.fromkeys(Path(run) for run in runs))
+    folder = Path(out) if out is not None else paths[0]
+    read = [read_sources(path) for path in paths]
+    charts: list[Chart | Timeline]
+    if len(read) == 1:
+        sections = figures_of(read[0])
+        facts = run_facts(read[0], sections, folder)
+        charts = [one for ones in sections.values() for one in ones]
+        name, drawn = "report", sections
+    else:
+        groups, differing = grouped(read)
+        compared = comparison_figures(groups)
+        facts = comparison_facts(groups, differing, compared)
+        charts = list(compared)
+        name, drawn = "comparison", {"learning": charts}
+    page = _rendered(f"{name}.html.jinja", facts, drawn)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / f"{name}.json", json_text(facts, indent=1).encode())
+        write_atomically(folder / f"{name}.html", page.encode())
+        if figures:
+            _write_figures(folder / ("figures" if name == "report" else "comparison_figures"), charts)
+    except OSError as error:
+        raise RunFolderError(
+            f"{folder} cannot be written ({error.strerror or error}), expected a writable folder; name "
+            "another with --out"
+        ) from error
+    return folder / f"{name}.html"
+
+
+def _write_figures(folder: Path, charts: Sequence[Chart | Timeline]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, content in figure_files(charts).items():
+        write_atomically(folder / name, content)
+
+
+def _rendered(template: str, facts: dict[str, Any], drawn: dict[str, list[Chart | Timeline]]) -> str:
+    environment = page_environment("switchmt_snn.viewing.report")
+    environment.filters |= {"duration": duration, "compact": compact}
+    environment.globals |= {"picture": _picture, "colour": series_colour, "beyond": _beyond}
+    return environment.get_template(template).render(facts=facts, drawn=drawn)
+
+
+def _picture(figure: Chart | Timeline) -> Markup:
+    """A figure as SVG; a timeline in two widths, of which the page shows the one that fits."""
+    if isinstance(figure, Timeline):
+        return Markup(inline_svg(picture_of(figure, WIDE), "wide") + inline_svg(picture_of(figure), "narrow"))
+    return Markup(inline_svg(picture_of(figure)))
+
+
+def _beyond(figure: Chart | Timeline) -> str:
+    """References that are too far away to draw, in words."""
+    if isinstance(figure, Timeline):
+        return ""
+    _, far = visible_references(figure)
+    return "Beyond the axis: " + ", ".join(f"{one.name} {digits(one.y)}" for one in far) + "." if far else ""
