@@ -20,6 +20,7 @@ from switchmt_snn.learning.switching import (
     CRITERIA,
     DECISION_COLUMNS,
     Criterion,
+    Deciding,
     EpisodeRecord,
     Stay,
     SwitchingPolicy,
@@ -376,6 +377,14 @@ class JudgesInWords(ReturnAbove):
     judges_learning = "no"  # type: ignore[assignment]
 
 
+class DecidingText(ReturnAbove):
+    deciding = ("mean_return",)  # type: ignore[assignment]
+
+
+class DecidingUnknown(ReturnAbove):
+    deciding = (Deciding("mean_return", ("target",)),)
+
+
 class TextSnapshots(ReturnAbove):
     @classmethod
     def snapshots(cls, config: SwitchingConfig) -> int:
@@ -420,6 +429,8 @@ class WithoutConfig(ReturnAbove):
         (NoComma, r"whose SAVED is 'returns', expected a tuple of names, as \(\"returns\",\) with its comma"),
         (DerivedAsText, r"whose DERIVED is 'bound', expected a tuple of names"),
         (JudgesInWords, "whose judges_learning is 'no', expected True or False"),
+        (DecidingText, r"whose deciding is \('mean_return',\), expected a tuple of Deciding"),
+        (DecidingUnknown, "whose deciding names 'target', expected one of mean_return, episodes_in_visit"),
         (TextSnapshots, "whose snapshots gave 'one', expected a whole number from 0"),
         (Fails, r"fails in end_of_episode \(AttributeError: 'EpisodeRecord' .* at test_switching.py, line"),
         (FailsInSecondVisit, r"fails in end_of_episode \(AttributeError: 'NoneType'"),
