@@ -108,7 +108,7 @@ def test_commands_in_messages_begin_as_the_program_was_called(tmp_path: Path, mo
     script = tmp_path / "switchmt-snn"
     script.write_text("")
     script.chmod(0o755)
-    text = "run switchmt-snn train; switchmt-snn: x; /elsewhere/switchmt-snn train; switchmt-snn runs"
+    text = "run switchmt-snn train; switchmt-snn: x; /elsewhere/switchmt-snn train; switchmt-snn walks"
     monkeypatch.setattr(sys, "argv", [str(script), "train"])
     monkeypatch.setenv("PATH", "/nowhere")
     assert names.runnable(text) == text.replace("run switchmt-snn train", f"run {script} train")
