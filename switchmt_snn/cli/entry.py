@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 
 from switchmt_snn import __version__
-from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, profile, report, runs, train
+from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, play, profile, report, runs, train
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.machine.program import runnable
 from switchmt_snn.viewing.output import speak_any_encoding
@@ -16,6 +16,7 @@ usage: switchmt-snn COMMAND [options]
 
   train [CONFIG]      train (CONFIG: a YAML file or a preset; default: quickstart), or continue the run of --run DIR
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
+  play [RUN]          film a run's agent beside its spikes, Q-values and gains (default: newest run)
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
   report [RUN ...]    one HTML page: curves, switches, speed, layers, scores; of several runs a comparison
@@ -31,6 +32,7 @@ usage: switchmt-snn COMMAND [options]
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train.command,
     "evaluate": evaluate.command,
+    "play": play.command,
     "export": export.command,
     "profile": profile.command,
     "report": report.command,

@@ -17,6 +17,7 @@ ARGUMENTS = {
     "train": ("CONFIG", "a YAML file or a preset (default: with --run the config of the run there, else quickstart)"),
     "describe": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
     "evaluate": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
+    "play": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "profile": ("RUN", "run folders, or NIR files (default: the run under runs/ that was begun last)"),
     "report": ("RUN", "run folders; several are compared (default: the run under runs/ that was begun last)"),

@@ -367,6 +367,17 @@ class QNetwork(nn.Module):
         outputs = self.readout.stream(lambda spikes: stream.outputs(spikes, context), spikes_TBN)
         return outputs if self.config.quantiles == 1 else outputs.unflatten(-1, (self.config.quantiles, -1))
 
+    def value(self, spikes_TBN: Tensor, task: int) -> Tensor | None:
+        """The value stream's value ``[B]`` for its hidden spikes; with quantiles their mean.
+
+        None if there is no value stream, or if the readout leaves no single value (``Readout.keeps_streams``).
+        """
+        if "value" not in self.streams or not self.readout.keeps_streams:
+            return None
+        stream = cast(Stream, self.streams["value"])
+        context = stream.context(task)
+        return self.readout.stream(lambda spikes: stream.outputs(spikes, context), spikes_TBN).mean(-1)
+
     def combine(self, outputs: dict[str, Tensor]) -> Tensor:
         """Q-values ``[..., A]`` from the streams' outputs ``[..., n]``."""
         if "q" in outputs:

@@ -24,7 +24,13 @@ from switchmt_snn.spiking.settings import require_known
 
 
 class Readout:
-    """What a stream's head does with the hidden spikes, and what becomes of the streams' combined outputs."""
+    """What a stream's head does with the hidden spikes, and what becomes of the streams' combined outputs.
+
+    Attributes:
+        keeps_streams: whether ``stream`` gives ``[B, O]``, so that a dueling network has one value per decision.
+    """
+
+    keeps_streams = True
 
     def __init__(self, beta: float) -> None:
         """``beta`` is the decay of M per simulation step."""
@@ -65,6 +71,8 @@ class LastMembrane(Readout):
 
 class MaxMembrane(Readout):
     """Largest membrane; of a dueling network the largest combined one."""
+
+    keeps_streams = False
 
     def integrate(self, outputs_TBO: Tensor) -> Tensor:
         """``[T, B, O]``."""

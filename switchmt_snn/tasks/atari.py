@@ -15,26 +15,32 @@ from switchmt_snn.config import TasksConfig, resolved_frame_stack
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PUBLISHED_SCORES
-from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite, VectorStep
+from switchmt_snn.tasks.suite import Picture, Suite, TaskEnvironment, TaskSuite, VectorStep
 
 SIDE_PIXELS = 84
+SCREEN_PIXELS = (210, 160)
+"""Height and width of the console's screen."""
 
 
 class AtariCopies:
     """Copies of one game. Frames are single (stacking is done once, in ``switchmt_snn.tasks.play``)."""
 
-    def __init__(self, game: str, num_envs: int, config: TasksConfig) -> None:
-        """Open the game; every option of AtariVectorEnv that changes what is learned is set explicitly."""
+    def __init__(self, game: str, num_envs: int, config: TasksConfig, in_colour: bool = False) -> None:
+        """Open the game; every option of AtariVectorEnv that changes what is learned is set explicitly.
+
+        ``in_colour`` gives the screen's own size and colours in place of what the network sees.
+        """
         self.num_envs = num_envs
+        height, width = SCREEN_PIXELS if in_colour else (SIDE_PIXELS, SIDE_PIXELS)
         self._env = AtariVectorEnv(
             game,
             num_envs,
             max_num_frames_per_episode=config.max_episode_frames,
             repeat_action_probability=config.sticky_action_probability,
             full_action_space=config.full_action_space,
-            img_height=SIDE_PIXELS,
-            img_width=SIDE_PIXELS,
-            grayscale=True,
+            img_height=height,
+            img_width=width,
+            grayscale=not in_colour,
             stack_num=1,
             frameskip=config.frame_skip,
             maxpool=config.frame_skip > 1,
@@ -73,6 +79,49 @@ class AtariCopies:
     def close(self) -> None:
         """Free the emulators."""
         self._env.close()
+
+
+class PicturedAtariCopies:
+    """Copies of one game beside copies in colour that are played by the same seeds and actions.
+
+    ale-py's vector environment shows a game either grey or in colour, so that two are played.
+    """
+
+    def __init__(self, game: str, num_envs: int, config: TasksConfig) -> None:
+        self.num_envs, self._game = num_envs, game
+        self._played = AtariCopies(game, num_envs, config)
+        self._shown = AtariCopies(game, num_envs, config, in_colour=True)
+        self._pictures = np.zeros((num_envs, *SCREEN_PIXELS, 3), np.uint8)
+
+    def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+        """As ``AtariCopies.reset``."""
+        self._pictures[env_ids] = self._shown.reset(env_ids, seeds)[:, 0]
+        return self._played.reset(env_ids, seeds)
+
+    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
+        """As ``AtariCopies.step``.
+
+        Raises:
+            TaskError: the copies in colour went another way, so that their pictures are of another game.
+        """
+        step, shown = self._played.step(actions), self._shown.step(actions)
+        if (step.rewards != shown.rewards).any() or (step.terminated != shown.terminated).any():
+            raise TaskError(
+                f"task {self._game!r} played in colour gave the rewards {shown.rewards.tolist()}, expected "
+                f"{step.rewards.tolist()}, those of the same game in grey; its pictures would be of another game"
+            )
+        self._pictures = np.asarray(shown.frames, np.uint8)[:, 0]
+        return step
+
+    def picture(self, env_id: int) -> Picture:
+        """The screen in colour, 210 x 160 pixels; with frame skip the brighter of its last two frames."""
+        picture: Picture = self._pictures[env_id].copy()
+        return picture
+
+    def close(self) -> None:
+        """Free the emulators."""
+        self._played.close()
+        self._shown.close()
 
 
 class AtariSuite(Suite):
@@ -147,6 +196,7 @@ class AtariSuite(Suite):
             make=make,
             thread_safe=True,
             versioned=True,
+            make_pictured=lambda task, num_envs: PicturedAtariCopies(config.names[task], num_envs, config),
         )
 
 

@@ -9,15 +9,16 @@ import numpy.typing as npt
 
 from switchmt_snn.config.plugins import user_code
 from switchmt_snn.errors import TaskError, shown
-from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
+from switchmt_snn.tasks.suite import Frames, Picture, TaskSuite, VectorStep
 
 METHODS = {
     "reset": "reset(env_ids, seeds) -> frames; of a Gymnasium environment, reset(seed=...) -> (observation, info)",
     "step": "step(actions) -> VectorStep; of a Gymnasium environment, step(action) -> (observation, reward, "
     "terminated, truncated, info)",
     "close": "close()",
+    "picture": 'picture(env_id) -> uint8 [H, W, 3] or None; of a Gymnasium environment, render() with "rgb_array"',
 }
-"""What environments must have, in words."""
+"""What environments must have, in words; ``picture`` is for those that can be drawn."""
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
 """Replay memories hold rewards as float32."""
@@ -42,9 +43,9 @@ class CheckedEnvironment:
         with self._code("make", "make(task, num_envs) -> the copies of a task"):
             self._environment = tasks.make(task, num_envs)
         seen = f"task {self._name!r} is played by {type(self._environment).__name__}, which has"
-        for method, expected in METHODS.items():
+        for method in ("reset", "step", "close"):
             if not callable(getattr(self._environment, method, None)):
-                raise TaskError(f"{seen} no {method}, expected {expected}")
+                raise TaskError(f"{seen} no {method}, expected {METHODS[method]}")
         count = getattr(self._environment, "num_envs", None)
         if count != num_envs:
             raise TaskError(f"{seen} num_envs {count!r}, expected the {num_envs} that make was asked for")
@@ -86,6 +87,26 @@ class CheckedEnvironment:
                 "finite numbers (float32); mend the environment's reward"
             )
         return result
+
+    def picture(self, env_id: int) -> Picture | None:
+        """A copy as people see the game ``[H, W, 3]``; None if there is no picture.
+
+        Raises:
+            TaskError: the environment's drawing fails, or gives something else.
+        """
+        draw = getattr(self._environment, "picture", None)
+        if draw is None:
+            return None
+        with self._code("picture", METHODS["picture"]):
+            picture = draw(env_id)
+        if picture is None:
+            return None
+        if not (isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (3,)):
+            shape, kind = getattr(picture, "shape", None), getattr(picture, "dtype", type(picture).__name__)
+            raise TaskError(
+                f"task {self._name!r} gave a picture of shape {shape} and type {kind}, expected uint8 [H, W, 3]"
+            )
+        return picture
 
     def close(self) -> None:
         """Free the copies."""

@@ -81,6 +81,7 @@ def require_tasks(tasks: Any, config: TasksConfig) -> TaskSuite:
         ("thread_safe", _truth, "True or False"),
         ("versioned", _truth, "True or False"),
         ("make", callable, "a function make(task, num_envs) -> the copies of a task"),
+        ("make_pictured", lambda make: make is None or callable(make), "None, or a function as make"),
     )
     for name, holds, expected in fields:
         value = getattr(tasks, name)

@@ -65,9 +65,12 @@ class GymSuite(Suite):
         is_image = layouts[0].is_image
         dtype: npt.DTypeLike = np.uint8 if is_image else np.float32
 
-        def make(task: int, num_envs: int) -> TaskEnvironment:
-            envs = [make_environment(names[task], wrappers) for _ in range(num_envs)]
+        def copies(task: int, num_envs: int, pictured: bool) -> GymCopies:
+            envs = [make_environment(names[task], wrappers, pictured) for _ in range(num_envs)]
             return GymCopies(names[task], envs, frame_shape, dtype, layouts[task].frame)
+
+        def make(task: int, num_envs: int) -> TaskEnvironment:
+            return copies(task, num_envs, pictured=False)
 
         return TaskSuite(
             names=names,
@@ -83,6 +86,7 @@ class GymSuite(Suite):
             first_actions=first_actions,
             thread_safe=is_gymnasiums,
             versioned=is_gymnasiums,
+            make_pictured=lambda task, num_envs: copies(task, num_envs, pictured=True),
         )
 
 

@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.errors import TaskError, shown
+from switchmt_snn.errors import MissingExtraError, TaskError, shown
 from switchmt_snn.tasks.randomness import OwnGenerators
-from switchmt_snn.tasks.suite import Frames, VectorStep
+from switchmt_snn.tasks.suite import Frames, Picture, VectorStep
 
 Env = gymnasium.Env[Any, Any]
 
@@ -46,6 +46,7 @@ class GymCopies:
         self._first_action = first_action(envs[0])
         # Environments that are not Gymnasium's own may draw from the global generators, and from their spaces.
         self._generators = [OwnGenerators() if is_outside(env) else None for env in envs]
+        self._drawing = OwnGenerators() if is_outside(envs[0]) else _NOTHING
         for env, generators in zip(envs, self._generators, strict=True):
             if generators is not None:
                 _give_own_spaces(env)
@@ -77,6 +78,27 @@ class GymCopies:
             terminated[i], truncated[i] = self._truth("terminated", ended), self._truth("truncated", cut)
             self._place(frames[i], observation, env)
         return VectorStep(frames, rewards, terminated, truncated)
+
+    def picture(self, env_id: int) -> Picture | None:
+        """What a copy's ``render`` gives, as bytes; None if it was made without pictures.
+
+        Raises:
+            MissingExtraError: drawing needs a package that is not installed.
+        """
+        env = self._envs[env_id]
+        if env.render_mode != "rgb_array":
+            return None
+        try:
+            with self._drawing:  # what drawing takes from the global generators, the play does not miss
+                picture = env.render()
+        except gymnasium.error.DependencyNotInstalled as error:
+            raise MissingExtraError(
+                f"pictures of {self._name} need a package that is not installed ({error}); "
+                "run: pip install 'switchmt-snn[video]'"
+            ) from error
+        array = np.asarray(picture)
+        # MinAtar's colours go from 0 to 1.
+        return np.rint(255 * array).astype(np.uint8) if array.dtype.kind == "f" else array
 
     @property
     def draws_globally(self) -> bool:

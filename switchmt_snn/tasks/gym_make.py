@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 from switchmt_snn.config.plugins import import_plugin_module, is_plugin, load_plugin, user_code
 from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
@@ -20,6 +21,8 @@ LONGEST_ID = 120
 """Characters of a task id; the longest of Gymnasium have 40."""
 MOST_COMBINATIONS = 512
 """Most actions that ``FlattenAction`` makes: a Q-network has an output for each."""
+PICTURES = "rgb_array"
+"""Gymnasium's name of the mode in which ``render`` gives pictures."""
 
 
 class FlattenAction(gymnasium.ActionWrapper[Any, int, Any]):
@@ -85,13 +88,14 @@ def parse_id(name: str) -> tuple[str | None, str]:
     return found["module"], found["id"]
 
 
-def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
+def make_environment(name: str, wrappers: Sequence[str] = (), pictured: bool = False) -> Env:
     """One environment of the gym suite, as training plays it.
 
     Args:
         name: ``EnvId``, or ``module:EnvId``, which imports ``module`` first, as Gymnasium does.
         wrappers: as ``tasks.wrappers``: ``FlattenObservation``, ``FlattenAction``, or ``module:Name``; the first is the
             innermost.
+        pictured: make it draw (``render_mode="rgb_array"``), if it can.
 
     Raises:
         TaskError: the id is unknown, or the environment or a wrapper cannot be made.
@@ -105,15 +109,16 @@ def make_environment(name: str, wrappers: Sequence[str] = ()) -> Env:
         _import(name, module)
     expected = "a Gymnasium environment with observation_space and action_space"
     with user_code(f"task {name!r} cannot be made", expected, TaskError):
-        env = _registered(name, env_id)
+        env = _registered(name, env_id, pictured)
     for wrapper in wrappers:
         env = _wrapped(name, env, wrapper)
     return env
 
 
-def _registered(name: str, env_id: str) -> Env:
+def _registered(name: str, env_id: str, pictured: bool) -> Env:
     try:
-        env: Env = gymnasium.make(env_id)
+        options: dict[str, Any] = {"render_mode": PICTURES} if pictured and _draws(env_id) else {}
+        env: Env = gymnasium.make(env_id, **options)
     except gymnasium.error.DependencyNotInstalled as error:
         raise TaskError(f"task {name!r} needs a package that is not installed ({error})") from error
     except ImportError as error:
@@ -125,6 +130,14 @@ def _registered(name: str, env_id: str) -> Env:
     except gymnasium.error.UnregisteredEnv as error:
         raise TaskError(f"tasks.names has the unknown Gymnasium id {name!r}{_hint(name)}") from error
     return env
+
+
+def _draws(env_id: str) -> bool:
+    """Whether an environment says that it can give pictures; its class is imported for that."""
+    point = gymnasium.spec(env_id).entry_point
+    made = load_env_creator(point) if isinstance(point, str) else point
+    metadata = getattr(made, "metadata", None)
+    return isinstance(metadata, dict) and PICTURES in metadata.get("render_modes", ())
 
 
 def _wrapped(name: str, env: Env, wrapper: str) -> Env:

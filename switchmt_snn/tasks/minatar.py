@@ -12,7 +12,7 @@ from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import MissingExtraError
 from switchmt_snn.tasks.gym_copies import Env, GymCopies
 from switchmt_snn.tasks.gym_spaces import channels_last
-from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
+from switchmt_snn.tasks.suite import Suite, TaskSuite
 
 GAMES = ("asterix", "breakout", "freeway", "seaquest", "space_invaders")
 ACTION_NAMES = ("NOOP", "LEFT", "UP", "RIGHT", "DOWN", "FIRE")
@@ -59,7 +59,7 @@ class MinAtarSuite(Suite):
             every = np.arange(len(ACTION_NAMES))
             valid_actions_KA = np.stack([np.isin(every, game.game.minimal_action_set()) for game in games])
 
-        def make(task: int, num_envs: int) -> TaskEnvironment:
+        def make(task: int, num_envs: int) -> GymCopies:
             envs = [_make_env(config.names[task], config) for _ in range(num_envs)]
             return GymCopies(
                 config.names[task], envs, frame_shape, np.uint8, channels_last, before_reset=_forget_previous_action
@@ -78,6 +78,7 @@ class MinAtarSuite(Suite):
             make=make,
             thread_safe=True,
             versioned=True,
+            make_pictured=make,
         )
 
 
@@ -86,7 +87,7 @@ def _make_env(game: str, config: TasksConfig) -> Env:
         from minatar.gym import BaseEnv
     except ModuleNotFoundError as error:
         raise MissingExtraError("MinAtar is not installed; run: pip install 'switchmt-snn[minatar]'") from error
-    env = BaseEnv(game, sticky_action_prob=config.sticky_action_probability)
+    env = BaseEnv(game, render_mode="rgb_array", sticky_action_prob=config.sticky_action_probability)
     return gymnasium.wrappers.TimeLimit(env, max_episode_steps=config.max_episode_frames)
 
 

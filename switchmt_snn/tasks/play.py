@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from switchmt_snn.errors import CheckpointError, require_saved
 from switchmt_snn.tasks.contract import CheckedEnvironment
-from switchmt_snn.tasks.suite import Frames, TaskSuite, VectorStep
+from switchmt_snn.tasks.suite import Frames, Picture, TaskSuite, VectorStep
 
 
 def episode_seed(root: int, task: int, episode: int) -> int:
@@ -71,6 +71,13 @@ class Play:
         for env_id, action in enumerate(actions.tolist()):
             self._actions[env_id].append(action)
         return result
+
+    def picture(self, env_id: int) -> Picture | None:
+        """A copy as people see the game ``[H, W, 3]``; None unless it is of ``TaskSuite.pictured`` and has a picture.
+
+        It shows the present state: after an episode's last step its end, until ``begin``.
+        """
+        return self._environment.picture(env_id)
 
     def close(self) -> None:
         """Free the environments."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -62,6 +62,17 @@ class TaskEnvironment(Protocol):
         """Free the copies."""
 
 
+Picture = npt.NDArray[np.uint8]
+"""A picture of a game: red, green, blue ``[H, W, 3]``."""
+
+
+class PicturedEnvironment(TaskEnvironment, Protocol):
+    """As ``TaskEnvironment``, and every copy can be drawn; drawing changes nothing that is played."""
+
+    def picture(self, env_id: int) -> Picture | None:
+        """A copy as people see the game, in its present state; None if the game draws nothing."""
+
+
 @dataclass(frozen=True)
 class Reference:
     """Published raw scores of a task, for normalised scores."""
@@ -95,6 +106,8 @@ class TaskSuite:
         thread_safe: whether copies may be stepped in several threads at a time; evaluations then use every core.
         versioned: whether the suite's ``packages``, ``files`` and this package hold all code that decides an episode.
             Random play is then kept beside a run and not played again. Default: no.
+        make_pictured: as ``make``, of environments that can be drawn: the same play for the same seeds and actions.
+            None if there are no pictures.
     """
 
     names: tuple[str, ...]
@@ -111,6 +124,11 @@ class TaskSuite:
     first_actions: tuple[int, ...] = ()
     thread_safe: bool = False
     versioned: bool = False
+    make_pictured: Callable[[int, int], PicturedEnvironment] | None = None
+
+    def pictured(self) -> TaskSuite:
+        """These tasks in environments that can be drawn (``Play.picture``), as far as they have pictures."""
+        return self if self.make_pictured is None else replace(self, make=self.make_pictured)
 
     def first_action(self, task: int) -> int:
         """The number by which a task's environment calls action 0."""

@@ -12,14 +12,12 @@ import pytest
 import torch
 
 from switchmt_snn.acting.agent import Agent
+from switchmt_snn.acting.episodes import EpisodeScore, Playing, play_episodes
 from switchmt_snn.acting.evaluation import (
     DecisionMaker,
-    EpisodeScore,
     EvaluationProtocol,
     EvaluationStopped,
-    Playing,
     evaluate_agent,
-    play_episodes,
     summarize,
 )
 from switchmt_snn.config import EvaluationConfig, TasksConfig

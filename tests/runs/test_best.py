@@ -63,7 +63,7 @@ def test_a_score_of_another_kind_is_not_compared(tmp_path: Path) -> None:
 
 
 def test_the_score_of_an_evaluation_is_the_rise_above_random_play() -> None:
-    from switchmt_snn.acting.evaluation import EpisodeScore
+    from switchmt_snn.acting.episodes import EpisodeScore
     from switchmt_snn.tasks.registry import make_suite
 
     suite = make_suite(from_dict(CARTPOLE).tasks)

@@ -1,0 +1,72 @@
+"""``switchmt-snn play``: film a run's agent beside its spikes."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from switchmt_snn.cli.parsing import parse, split_one
+from switchmt_snn.runs.files import file_name, json_text
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Film a run's agent: the game beside spikes, Q-values and gains; every number also goes to a CSV and a JSON."""
+
+    task: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Which task; may be repeated, for tasks side by side. Default: the run's first."""
+    episodes: int | None = None
+    """Episodes of each task. Default: one, or as many as fit into --seconds."""
+    seconds: float | None = None
+    """Longest film in seconds. Default: 60, or until the --episodes end."""
+    seed: int | None = None
+    """Seed of environments and random actions. Default: the run's evaluation.seed."""
+    epsilon: float | None = None
+    """Share of random actions. Default: the run's evaluation.epsilon."""
+    checkpoint: Literal["last", "best"] = "last"
+    """Which weights."""
+    runtime: Literal["torch"] = "torch"
+    """What plays. torch: the trained network."""
+    out: Path | None = None
+    """FILE.mp4, FILE.gif, or a folder for PNG frames. Default: RUN/films/TASK-step-N.mp4."""
+    fps: float | None = None
+    """Frames (decisions) per second. Default: real time for Atari, else 15."""
+    json: bool = False
+    """Print the film's facts as JSON."""
+
+
+def command(argv: list[str]) -> int:
+    """Run the command; returns its exit code."""
+    run, rest = split_one(PlayOptions, argv, "play", PlayOptions())
+    options = parse(PlayOptions, rest, "play", PlayOptions())
+    from switchmt_snn.acting.evaluation import EvaluationProtocol
+    from switchmt_snn.export.watching import watched_agent
+    from switchmt_snn.runs.folder import latest_run
+    from switchmt_snn.viewing.film.film import FilmSettings, make_film
+
+    path = Path(run) if run is not None else latest_run()
+    settings = FilmSettings(options.task, options.episodes, options.seconds, options.fps).require()
+    agent = watched_agent(path, options.runtime, options.checkpoint)
+    changes = {name: getattr(options, name) for name in ("seed", "epsilon") if getattr(options, name) is not None}
+    config = agent.agent.config
+    evaluation = replace(config.evaluation, episodes=options.episodes or 1, num_envs=1, **changes)
+    names = tuple(agent.suite.names[agent.suite.index(name)] for name in options.task) or agent.suite.names[:1]
+    out = options.out or path / "films" / f"{file_name(*names)}-step-{agent.step}.mp4"
+    film = make_film(agent, EvaluationProtocol.of(evaluation, config.tasks), settings, out, note=_say)
+    if options.json:
+        print(json_text({"film": str(film.path), **film.facts}))
+        return 0
+    for lane in film.facts["tasks"]:
+        scores = ", ".join(f"{episode['score']:g}" for episode in lane["episodes"])
+        print(f"{lane['task']}: {'returns ' + scores if scores else 'no episode ended'}")
+    print(f"{film.frames:,} frames at {film.facts['fps']:g} per second")
+    print(film.path)
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
