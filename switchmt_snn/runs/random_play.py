@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from switchmt_snn import tasks as tasks_package
+from switchmt_snn.acting import episodes as episodes_module
 from switchmt_snn.acting import evaluation as evaluation_module
-from switchmt_snn.acting.evaluation import EpisodeScore, EvaluationProtocol
+from switchmt_snn.acting.episodes import EpisodeScore
+from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.runs.environment import processor
 from switchmt_snn.runs.files import file_name, json_text, sha256, write_atomically
@@ -87,7 +89,7 @@ def _facts(config: ExperimentConfig, protocol: EvaluationProtocol) -> dict[str, 
     settings = {field.name: getattr(config.tasks, field.name) for field in fields(config.tasks)}
     settings.pop("num_envs")  # of training; the protocol has its own
     folder = Path(tasks_package.__file__ or "").parent
-    code = [*sorted(folder.glob("*.py")), Path(evaluation_module.__file__)]
+    code = [*sorted(folder.glob("*.py")), Path(episodes_module.__file__), Path(evaluation_module.__file__)]
     facts = {
         "protocol": played,
         "tasks": settings,
