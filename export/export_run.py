@@ -28,7 +28,8 @@ from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, read_nir
 from switchmt_snn.runs.evaluations import evaluation_name
 from switchmt_snn.runs.files import file_name, json_text, write_atomically, written_whole
-from switchmt_snn.runs.folder import RunFolder, latest_run
+from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
@@ -88,7 +89,7 @@ def export(
     """Write a run's network as ONNX and NIR files and check them.
 
     Args:
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         settings: what to write.
         checkpoint: ``last`` or ``best``.
         out: where; None takes the run's ``export/`` folder.
@@ -104,7 +105,7 @@ def export(
     if (settings.tasks or settings.unroll) and settings.nir and not settings.onnx:
         option, file = ("--task", "decision_TASK.onnx") if settings.tasks else ("--unroll", "unrolled.onnx")
         raise ConfigError(f"{option} writes {file}, expected --onnx with it (--nir writes every task); add --onnx")
-    run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    run_folder = open_run(run, to_write=True)
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
     network = fold_agent(agent)
@@ -248,7 +249,7 @@ def evaluate_exported(
 
     Args:
         runtime: ``onnx`` (``export/decision.onnx``) or ``nir`` (``export/<task>.nir`` in the reference interpreter).
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         task: one task's name; None evaluates all.
         checkpoint: which weights the share of equal actions refers to.
         protocol: fields of EvaluationConfig to change.
@@ -259,7 +260,7 @@ def evaluate_exported(
     Raises:
         ExportError: an unknown runtime; the run was not exported, or its files are of another training step.
     """
-    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    folder = open_run(run, to_write=True)
     agent = load_agent(folder.path, checkpoint, "cpu")
     suite, config = agent.suite, agent.config
     played = _runtime(folder, runtime, suite, config)
@@ -287,7 +288,7 @@ def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads:
     """A run's exported files as an agent: ``q_values(observations, task)`` for raw observations ``[B, ...]``.
 
     Args:
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         runtime: ``onnx``, the fastest way to act on a CPU (docs/performance.md), or ``nir``.
         threads: of onnxruntime. With more than one a decision is faster, and sums may have another order.
 
@@ -303,7 +304,7 @@ def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads:
         >>> agent.q_values(observations, task=0).shape
         (5, 3)
     """
-    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    folder = open_run(run)
     config = folder.config()
     return _runtime(folder, runtime, make_suite(config.tasks), config, threads)
 

@@ -32,7 +32,7 @@ from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.runs.environment import command_line
 from switchmt_snn.runs.files import json_text, write_atomically
-from switchmt_snn.runs.folder import RunFolder, latest_run
+from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.tasks.registry import suite_of
 
@@ -68,7 +68,7 @@ def profile(
     """Count what a run's network does on recorded decisions of each task; write JSON, CSV and an HTML report.
 
     Args:
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         decisions: recorded decisions per task, rounded up to a multiple of the copies that are recorded.
         checkpoint: ``last`` or ``best``.
         out: where; None takes the run's ``profile/`` folder.
@@ -87,7 +87,7 @@ def profile(
     if not 1 <= decisions <= MAX_DECISIONS:
         raise ConfigError(f"decisions is {decisions}, expected 1 to {MAX_DECISIONS:,}")
     selection = Selection.of(targets)
-    run_folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    run_folder = open_run(run, to_write=True)
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     network = fold_agent(agent)  # refuses weights that are not finite before anything is played
     if not network.spiking:

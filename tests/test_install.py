@@ -31,6 +31,8 @@ assert any(path.name == "loihi-2018.yaml" for path in r.files("switchmt_snn.expo
 assert any(path.name == "speck.yaml" for path in r.files("switchmt_snn.export.chips.builtin").iterdir())
 templates = r.files("switchmt_snn.export.report").joinpath("templates")
 assert any(path.name.endswith(".jinja") for path in templates.iterdir())
+from switchmt_snn import load_agent
+assert load_agent("pretrained/cartpole").act([0.0, 0.0, 0.0, 0.0]) in (0, 1)
 print("whole")
 """
 """What an install must hold, wherever Python is started."""

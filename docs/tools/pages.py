@@ -45,7 +45,7 @@ def configuration_page() -> str:
         "agent steps: one decision, `tasks.frame_skip` emulator frames in Atari.",
         "",
         "Presets: `quickstart` (the default of `train`), `paper` (the paper's text), `released` (the authors' script),",
-        "`cartpole` (learns in a minute), `classic` (CartPole and Acrobot in one network, some minutes), `minatar`",
+        "`cartpole` (learns in a minute), `classic` (CartPole and Acrobot in one network, some minutes), `pong`, `minatar`",
         "(three small games that learn on a CPU), `strong` (three Atari games on a CPU in an afternoon; being",
         "measured, results/atari), `fast` (for a GPU; not run on one yet).",
         "`docs/algorithm.md` says where the presets come from.",

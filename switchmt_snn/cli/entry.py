@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 
 from switchmt_snn import __version__
-from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, play, profile, report, runs, train
+from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, pack, play, profile, report, runs, train
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.machine.program import runnable
 from switchmt_snn.viewing.output import speak_any_encoding
@@ -21,6 +21,7 @@ usage: switchmt-snn COMMAND [options]
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
   report [RUN ...]    one HTML page: curves, switches, speed, layers, scores; of several runs a comparison
   runs [FOLDER]       the run folders with method, tasks, steps, status, scores and size (default: runs/)
+  pack [RUN]          a run without its replay, to give away: config, logs, evaluations, weights (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   check-env ID ...    what an environment is taken for, how it plays, and why training would refuse it
   doctor              versions, games and devices of this installation
@@ -37,6 +38,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "profile": profile.command,
     "report": report.command,
     "runs": runs.command,
+    "pack": pack.command,
     "describe": describe.command,
     "check-env": check_env.command,
     "doctor": doctor.command,

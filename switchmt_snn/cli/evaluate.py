@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from switchmt_snn.cli.parsing import parse, split_one
@@ -41,11 +40,11 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     run, rest = split_one(EvaluateOptions, argv, "evaluate", EvaluateOptions())
     options = parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
-    from switchmt_snn.runs.folder import latest_run
+    from switchmt_snn.runs.packing import open_run
     from switchmt_snn.runs.run import evaluate
     from switchmt_snn.viewing.tables import evaluation_table
 
-    path = Path(run) if run is not None else latest_run()
+    path = open_run(run, to_write=True).path
     names = ("episodes", "epsilon", "seed", "num_envs", "max_episode_steps")
     protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     facts: dict[str, Any] = {}

@@ -16,12 +16,13 @@ from switchmt_snn.errors import ConfigError
 ARGUMENTS = {
     "train": ("CONFIG", "a YAML file or a preset (default: with --run the config of the run there, else quickstart)"),
     "describe": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
-    "evaluate": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
-    "play": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
-    "export": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
-    "profile": ("RUN", "run folders, or NIR files (default: the run under runs/ that was begun last)"),
+    "evaluate": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
+    "play": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
+    "export": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
+    "profile": ("RUN", "run folders, pretrained/NAME, or NIR files (default: the run under runs/ that was begun last)"),
     "report": ("RUN", "run folders; several are compared (default: the run under runs/ that was begun last)"),
     "runs": ("FOLDER", "a folder with run folders, or one run folder (default: runs/)"),
+    "pack": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "check-env": ("ID", "names of environments; several must fit one network"),
     "doctor": ("", ""),
 }

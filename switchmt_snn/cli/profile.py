@@ -42,7 +42,7 @@ def command(argv: list[str]) -> int:
     names, rest = split(ProfileOptions, argv, "profile", ProfileOptions())
     options = parse(ProfileOptions, rest, "profile", ProfileOptions())
     from switchmt_snn.export import ProfileResult, compare_profiles, profile, profile_file
-    from switchmt_snn.runs.folder import RunFolder
+    from switchmt_snn.runs.packing import open_run
 
     files = [name for name in names if name.endswith(".nir")]
     if (options.observations is not None) != bool(files):
@@ -57,7 +57,7 @@ def command(argv: list[str]) -> int:
             "--reset and --fires-at-threshold are for NIR files, expected neither for a run; leave them out"
         )
     for path in set(names) - set(files):  # all of them, before the first is profiled
-        RunFolder(Path(path)).require()
+        open_run(path)
     profiles: list[ProfileResult] = []
     # With several, --out is for the comparison; each one's own files go to its own folder.
     out = options.out if len(names) < 2 else None

@@ -89,6 +89,10 @@ def clips_rewards(config: ExperimentConfig) -> bool:
     return suite_defaults(config.tasks.suite).clip_rewards if asked is None else asked
 
 
+_HIDDEN_UNITS = {"nature": 512, "nature_half": 256}
+"""Units of each stream's hidden layer where the config names none; 128 for other trunks."""
+
+
 def resolve(config: ExperimentConfig) -> ExperimentConfig:
     """Replace every ``auto`` and null that has a rule; idempotent. A run stores the resolved config.
 
@@ -104,7 +108,7 @@ def resolve(config: ExperimentConfig) -> ExperimentConfig:
         network,
         trunk=trunk,  # type: ignore[arg-type]
         dendrites=dendrites,
-        hidden_units=network.hidden_units or (512 if trunk == "nature" else 128),
+        hidden_units=network.hidden_units or _HIDDEN_UNITS.get(trunk, 128),
         timesteps=network.timesteps if traits.spiking else 1,
     )
     policy, tasks = config.switching.policy, config.tasks

@@ -22,10 +22,11 @@ class NetworkConfig:
 
     method: Method = "SwitchMT"
     """DQN, DSQN, DQN_D, DSQN_D, MTSpark_AD, MTSpark_ADD or SwitchMT: fixes neurons, dueling structure and dendrites."""
-    trunk: Literal["auto", "nature", "minatar", "mlp"] = "auto"
-    """Feature layers: three convolutions (84x84), one (10x10), or one linear layer; auto follows tasks.suite."""
+    trunk: Literal["auto", "nature", "nature_half", "minatar", "mlp"] = "auto"
+    """Feature layers: three convolutions (84x84; nature_half has half as many channels), one (10x10), or one linear
+    layer; auto follows tasks.suite."""
     hidden_units: int | None = None
-    """Units of each stream's hidden layer; null takes 512 for nature and 128 otherwise."""
+    """Units of each stream's hidden layer; null takes 512 for nature, 256 for nature_half and 128 otherwise."""
     heads: Literal["shared", "per_task"] = "shared"
     """The last linear layer of each stream: one for all tasks (paper), or one for each task. An export for a task holds
     that task's only."""

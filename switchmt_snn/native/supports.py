@@ -24,7 +24,7 @@ from switchmt_snn.spiking.normalization import FixedBatchNorm, TaskBatchNorm
 _ANY = object()
 _SETTINGS: dict[str, object] = {
     "method": tuple(name for name, traits in METHOD_TRAITS.items() if traits.spiking),
-    "trunk": ("nature", "minatar", "mlp"),
+    "trunk": ("nature", "nature_half", "minatar", "mlp"),
     "hidden_units": _ANY,
     "timesteps": _ANY,
     "encoding": _ANY,  # inputs are encoded by the network's own operations

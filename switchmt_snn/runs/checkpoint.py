@@ -31,6 +31,7 @@ from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
 FORMAT = 3
 """Goes up when a saved state gets another shape. 2: paused episodes of every task. Weights are read from any."""
 _STEP_DIGITS = 12
+_MODEL_FILE = "model.safetensors"
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,10 @@ def fitting_weights() -> Iterator[None]:
         ) from error
 
 
+class _WeightsOnly(CheckpointError):
+    """A checkpoint that was made to be read, not to be continued."""
+
+
 class CheckpointStore:
     """The checkpoints of one run folder."""
 
@@ -112,7 +117,7 @@ class CheckpointStore:
         try:
             model, training, tree = _split(state)
             files = {
-                "model.safetensors": safetensors.torch.save(model),
+                _MODEL_FILE: safetensors.torch.save(model),
                 "training.safetensors": safetensors.torch.save(training),
                 "state.json": json.dumps(tree).encode(),
             }
@@ -129,14 +134,20 @@ class CheckpointStore:
 
     def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float, judged_by: str) -> None:
         """Keep these weights as the best so far (weights only)."""
-        temporary, final = self.folder / ".best.tmp", self.folder / "best"
+        self._save_model(self.folder / "best", network_state, {"step": step, "score": score, "judged_by": judged_by})
+
+    def save_weights(self, step: int, network_state: dict[str, torch.Tensor]) -> None:
+        """Write a checkpoint that can be read but not continued: weights only."""
+        self._save_model(self.folder / _name(step), network_state, {"step": step})
+
+    def _save_model(self, final: Path, network_state: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
+        temporary = self.folder / f".{final.name}.tmp"
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         try:
             model = {name: tensor.detach().cpu().contiguous() for name, tensor in network_state.items()}
-            files = {"model.safetensors": safetensors.torch.save(model)}
-            facts = {"step": step, "score": score, "judged_by": judged_by, "segments": [], "logs": {}}
-            self._write_folder(temporary, files, facts)
+            files = {_MODEL_FILE: safetensors.torch.save(model)}
+            self._write_folder(temporary, files, {**facts, "segments": [], "logs": {}})
             shutil.rmtree(final, ignore_errors=True)
             temporary.rename(final)
         except OSError:
@@ -201,12 +212,14 @@ class CheckpointStore:
         """Read the newest checkpoint that is whole; fills the replays with frames and small arrays.
 
         Raises:
-            CheckpointError: there is none, or none is whole.
+            CheckpointError: there is none, none is whole, or the newest one holds weights only.
         """
         damaged: list[str] = []
         for path in self.paths():
             try:
                 return self._load_one(path, replays, tuple(damaged))
+            except _WeightsOnly:
+                raise
             except CheckpointError as error:
                 damaged.append(f"checkpoint {path.name} is damaged ({error})")
         if damaged:
@@ -220,7 +233,12 @@ class CheckpointStore:
         manifest = _read_manifest(path)
         if manifest["format"] < FORMAT:
             raise CheckpointError(f"format {manifest['format']} can be evaluated, but only {FORMAT} can be continued")
-        model = _read_tensors(path, "model.safetensors", manifest)
+        if list(manifest["files"]) == [_MODEL_FILE]:
+            raise _WeightsOnly(
+                f"{path} holds weights only (a packed run), expected a run with its replay; it can be evaluated, "
+                "exported and profiled, but training needs a new run: --run NEW_FOLDER"
+            )
+        model = _read_tensors(path, _MODEL_FILE, manifest)
         training = _read_tensors(path, "training.safetensors", manifest)
         tree = _read_json(_read_file(path, "state.json", manifest), "state.json")
         state = _join(tree, model, training)
@@ -274,7 +292,7 @@ class CheckpointStore:
         for path in [self.folder / "best"] if which == "best" else self.paths():
             try:
                 manifest = _read_manifest(path)
-                return int(manifest["step"]), _read_tensors(path, "model.safetensors", manifest), tuple(damaged)
+                return int(manifest["step"]), _read_tensors(path, _MODEL_FILE, manifest), tuple(damaged)
             except CheckpointError as error:
                 damaged.append(f"checkpoint {path.name} is damaged ({error})")
         seen = "; ".join(damaged) if damaged and which != "best" else "none"

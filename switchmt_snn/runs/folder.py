@@ -46,7 +46,7 @@ def claim_new_run(name: str) -> RunFolder:
         except FileExistsError:
             continue
         except OSError as error:
-            raise RunFolderError(_unwritable(path, error)) from error
+            raise RunFolderError(unwritable(path, error)) from error
         return RunFolder(path)
     raise AssertionError("unreachable: the numbers do not end")
 
@@ -175,7 +175,7 @@ class RunFolder:
             # Last: a folder is a run once this file says so.
             write_atomically(self.path / "environment.json", json_text(environment, indent=1).encode())
         except OSError as error:
-            raise RunFolderError(_unwritable(self.path, error)) from error
+            raise RunFolderError(unwritable(self.path, error)) from error
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Replace the stored config (a raised step budget)."""
@@ -199,7 +199,7 @@ class RunFolder:
                 "one with --run"
             ) from error
         except OSError as error:
-            raise RunFolderError(_unwritable(self.path, error)) from error
+            raise RunFolderError(unwritable(self.path, error)) from error
         return lock
 
     @property
@@ -223,7 +223,7 @@ class RunFolder:
         try:
             return self.evaluations.save(evaluation)
         except OSError as error:
-            raise RunFolderError(_unwritable(self.evaluations.folder, error)) from error
+            raise RunFolderError(unwritable(self.evaluations.folder, error)) from error
 
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""
@@ -234,7 +234,8 @@ class RunFolder:
         return {task: (values[:episodes], values[-episodes:]) for task, values in by_task.items()}
 
 
-def _unwritable(path: Path, error: OSError) -> str:
+def unwritable(path: Path, error: OSError) -> str:
+    """The line for a folder that the system does not let be written."""
     return f"{path} cannot be written ({error.strerror or error}), expected a writable folder; name another with --run"
 
 

@@ -25,8 +25,9 @@ from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.environment import describe_environment
-from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run, latest_run
+from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
 from switchmt_snn.runs.logs import RunLogs
+from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.plan import decide, plan
 from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.signals import stop_requests
@@ -333,7 +334,7 @@ def load_agent(
     """The trained agent of a run.
 
     Args:
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         checkpoint: ``last`` or ``best``.
         device: as in the config.
         threads: CPU threads of PyTorch, for the whole process; None leaves them. With more than one a decision may be
@@ -356,7 +357,7 @@ def load_agent(
     """
     if threads is not None:
         torch.set_num_threads(threads)
-    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    folder = open_run(run)
     config = folder.config()
     suite = make_suite(config.tasks)
     step, weights, _ = folder.checkpoints().load_model(checkpoint)
@@ -377,7 +378,7 @@ def evaluate(
     """Evaluate a run's agent and the random policy.
 
     Args:
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         task: one task's name; None evaluates all.
         checkpoint: ``last`` or ``best``.
         save: write JSON and CSV to the run's ``evaluations/``.
@@ -387,7 +388,7 @@ def evaluate(
     Raises:
         SwitchMTError: no run, no checkpoint, no such task, or a protocol out of range.
     """
-    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    folder = open_run(run, to_write=save)
     agent = load_agent(folder.path, checkpoint)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)

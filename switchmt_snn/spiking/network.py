@@ -39,6 +39,7 @@ from switchmt_snn.spiking.settings import require_known
 
 CONVOLUTIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "nature": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
+    "nature_half": ((16, 8, 4), (32, 4, 2), (32, 3, 1)),
     "minatar": ((16, 3, 1),),
     "mlp": (),
 }

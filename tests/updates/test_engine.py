@@ -25,7 +25,7 @@ from switchmt_snn.updates.engine import ENGINES
 from tests.conftest import small_config
 
 CPU = torch.device("cpu")
-SIDES = {"nature": 84, "minatar": 10, "mlp": 10}
+SIDES = {"nature": 84, "nature_half": 84, "minatar": 10, "mlp": 10}
 OTHER_NEURONS = {
     "neuron": "LIF",
     "reset": "subtract",
@@ -117,6 +117,7 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
         {"trunk": "mlp", "threshold": 0.2},
         {"trunk": "mlp", "mlp_normalization": "batch", "stream_normalization": "batch"},
         {"trunk": "nature", "threshold": 0.5},
+        {"trunk": "nature_half", "threshold": 0.5},
         {"quantiles": 4},
         {"quantiles": 3, "readout": "last_membrane", "method": "DSQN"},
         {"heads": "per_task", "threshold": 0.3},
@@ -131,6 +132,7 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
         "mlp",
         "mlp-normalized",
         "nature",
+        "nature-half",
         "quantiles",
         "quantiles-last",
         "heads",
@@ -151,6 +153,7 @@ def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any])
         OTHER_NEURONS,
         {"readout": "max_membrane"},
         {"trunk": "nature"},
+        {"trunk": "nature_half"},
         {"trunk": "mlp"},
         {"quantiles": 5},
         {"heads": "per_task", "threshold": 0.3},

@@ -1,0 +1,107 @@
+"""Runs to give away: a run without its replay, and the ones that come with the package (``pretrained/NAME``)."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from switchmt_snn.errors import RunFolderError, nearest
+from switchmt_snn.runs.files import write_atomically
+from switchmt_snn.runs.folder import RunFolder, latest_run, unwritable
+
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+"""Packed runs of the package: one folder each."""
+
+_PREFIX = "pretrained"
+_FILES = ("config.yaml", "environment.json", "code_changes.jsonl", "metrics.jsonl", "episodes.csv", "switches.csv")
+
+
+def pretrained_names() -> list[str]:
+    """What can follow ``pretrained/``."""
+    return sorted(path.parent.name for path in PRETRAINED.glob("*/environment.json"))
+
+
+def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder:
+    """The run that a user names: a folder, ``pretrained/NAME`` of the package, or None for the newest under ``runs/``.
+
+    Args:
+        run: a folder of that name comes before a pretrained run.
+        to_write: files will be added to the run. A pretrained run is then copied to ``runs/pretrained/NAME`` the first
+            time, and opened there from then on: the package's own files stay as they are.
+
+    Raises:
+        RunFolderError: no such run, or it cannot be copied.
+    """
+    if run is None:
+        return RunFolder(latest_run()).require()
+    path = Path(run)
+    if path.exists() or len(path.parts) != 2 or path.parts[0] != _PREFIX:
+        return RunFolder(path).require()
+    name = path.parts[1]
+    if name not in pretrained_names():
+        raise RunFolderError(
+            f"no pretrained run {name!r}, expected one of {', '.join(pretrained_names())}"
+            f"{nearest(name, pretrained_names())}"
+        )
+    if not to_write:
+        return RunFolder(PRETRAINED / name)
+    copied = Path("runs") / _PREFIX / name
+    if not RunFolder(copied).is_run:
+        _whole_copy(PRETRAINED / name, copied)
+    return RunFolder(copied)
+
+
+def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> Path:
+    """Copy what others need of a run: config, logs, evaluations and the weights of one checkpoint, without the replay.
+
+    The copy is a run folder for every command that reads one. Training cannot be continued from it: that needs the
+    replay, the optimizer's moments and the environments' states.
+
+    Args:
+        run: as for ``open_run``.
+        out: the new folder.
+        checkpoint: which weights, ``last`` or ``best``.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        RunFolderError: no such run; ``out`` exists or cannot be written.
+        CheckpointError: no whole checkpoint.
+    """
+    folder, out = open_run(run), Path(out)
+    if out.exists():
+        raise RunFolderError(f"{out} exists, expected a new folder; name another with --out, or delete it")
+    step, weights, _ = folder.checkpoints().load_model(checkpoint)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as made:
+            packed = RunFolder(Path(made) / out.name)
+            packed.path.mkdir()
+            for name in _FILES:
+                if (folder.path / name).is_file():
+                    write_atomically(packed.path / name, (folder.path / name).read_bytes())
+            for path in sorted(folder.evaluations.folder.glob(f"step-{step:012d}_*")):
+                (packed.path / "evaluations").mkdir(exist_ok=True)
+                write_atomically(packed.path / "evaluations" / path.name, path.read_bytes())
+            packed.checkpoints().save_weights(step, weights)
+            packed.path.rename(out)
+    except OSError as error:
+        raise RunFolderError(unwritable(out, error)) from error
+    return out
+
+
+def _whole_copy(source: Path, target: Path) -> None:
+    """Copy a folder so that it is whole or absent; of two processes that do it at once, one wins."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as made:
+            shutil.copytree(source, Path(made) / target.name, copy_function=shutil.copyfile)
+            try:
+                (Path(made) / target.name).rename(target)
+            except OSError:
+                if not RunFolder(target).is_run:
+                    raise
+    except OSError as error:
+        raise RunFolderError(unwritable(target, error)) from error
