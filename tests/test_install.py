@@ -32,7 +32,8 @@ assert any(path.name == "speck.yaml" for path in r.files("switchmt_snn.export.ch
 templates = r.files("switchmt_snn.export.report").joinpath("templates")
 assert any(path.name.endswith(".jinja") for path in templates.iterdir())
 from switchmt_snn import load_agent
-assert load_agent("pretrained/cartpole").act([0.0, 0.0, 0.0, 0.0]) in (0, 1)
+import numpy
+assert load_agent("pretrained/cartpole").act(numpy.zeros(4, numpy.float32), "CartPole-v1") in (0, 1)
 print("whole")
 """
 """What an install must hold, wherever Python is started."""
