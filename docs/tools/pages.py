@@ -21,6 +21,7 @@ from docs.tools.control_page import cartpole_page, classic_page
 from docs.tools.energy_page import energy_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
+from docs.tools.pretrained_page import pretrained_page
 from docs.tools.profile_spread import spread
 from docs.tools.recipe_page import recipe_page
 from switchmt_snn.acting.evaluation import EvaluationProtocol
@@ -45,8 +46,8 @@ def configuration_page() -> str:
         "agent steps: one decision, `tasks.frame_skip` emulator frames in Atari.",
         "",
         "Presets: `quickstart` (the default of `train`), `paper` (the paper's text), `released` (the authors' script),",
-        "`cartpole` (learns in a minute), `classic` (CartPole and Acrobot in one network, some minutes), `pong`, `minatar`",
-        "(three small games that learn on a CPU), `strong` (three Atari games on a CPU in an afternoon; being",
+        "`cartpole` (learns in a minute), `classic` (CartPole and Acrobot in one network, some minutes), `minatar`",
+        "(three small games that learn on a CPU), `pong` (one Atari game, half the channels), `strong` (three Atari games on a CPU in an afternoon; being",
         "measured, results/atari), `fast` (for a GPU; not run on one yet).",
         "`docs/algorithm.md` says where the presets come from.",
     ]
@@ -355,6 +356,7 @@ PAGES = {
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,
     "results/recipe/README.md": recipe_page,
+    "switchmt_snn/pretrained/README.md": pretrained_page,
     "results/atari/README.md": atari_page,
     "results/cartpole/README.md": cartpole_page,
     "results/classic/README.md": classic_page,
