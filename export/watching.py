@@ -19,7 +19,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.parity.activity import active_neurons
 from switchmt_snn.export.parity.compare import Trace
 from switchmt_snn.export.runtimes.agents import existing_only
-from switchmt_snn.runs.folder import RunFolder, latest_run
+from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.run import load_agent
 
 Tracer = Callable[[npt.NDArray[Any], int, int], Trace]
@@ -69,14 +69,14 @@ def watched_agent(run: str | Path | None = None, runtime: str = "torch", checkpo
     """A run's agent, watched.
 
     Args:
-        run: run folder; None takes the newest under ``runs/``.
+        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
         runtime: ``torch``: the trained network.
         checkpoint: ``last`` or ``best``.
 
     Raises:
         ExportError: an unknown runtime.
     """
-    folder = RunFolder(Path(run) if run is not None else latest_run()).require()
+    folder = open_run(run)
     if runtime == "torch":
         return Watched(load_agent(folder.path, checkpoint, "cpu"), trace_network, runtime)
     raise ExportError(f"the runtime is {runtime!r}, expected torch")

@@ -20,7 +20,10 @@ ARGUMENTS = {
     "play": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "profile": ("RUN", "run folders, pretrained/NAME, or NIR files (default: the run under runs/ that was begun last)"),
-    "report": ("RUN", "run folders; several are compared (default: the run under runs/ that was begun last)"),
+    "report": (
+        "RUN",
+        "run folders or pretrained/NAME; several are compared (default: the run that was begun last)",
+    ),
     "runs": ("FOLDER", "a folder with run folders, or one run folder (default: runs/)"),
     "pack": ("RUN", "a run folder (default: the run under runs/ that was begun last)"),
     "check-env": ("ID", "names of environments; several must fit one network"),

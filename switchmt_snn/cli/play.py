@@ -45,10 +45,10 @@ def command(argv: list[str]) -> int:
     options = parse(PlayOptions, rest, "play", PlayOptions())
     from switchmt_snn.acting.evaluation import EvaluationProtocol
     from switchmt_snn.export.watching import watched_agent
-    from switchmt_snn.runs.folder import latest_run
+    from switchmt_snn.runs.packing import open_run
     from switchmt_snn.viewing.film.film import FilmSettings, make_film
 
-    path = Path(run) if run is not None else latest_run()
+    path = open_run(run, to_write=True).path
     settings = FilmSettings(options.task, options.episodes, options.seconds, options.fps).require()
     agent = watched_agent(path, options.runtime, options.checkpoint)
     changes = {name: getattr(options, name) for name in ("seed", "epsilon") if getattr(options, name) is not None}

@@ -24,10 +24,11 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     names, rest = split(ReportOptions, argv, "report", ReportOptions())
     options = parse(ReportOptions, rest, "report", ReportOptions())
-    from switchmt_snn.runs.folder import latest_run
+    from switchmt_snn.runs.packing import open_run
     from switchmt_snn.viewing.report.page import write_report
 
-    runs = [Path(name) for name in names] or [latest_run()]
+    chosen: list[str | None] = [*names] or [None]  # None is the newest run
+    runs = [open_run(name, to_write=True).path for name in chosen]
     page = write_report(runs, options.out, options.figures)
     print(page.with_suffix(".json").read_text("utf-8") if options.json else page)
     return 0
