@@ -12,6 +12,7 @@ from typing import Any
 import nir
 import numpy.typing as npt
 import onnx
+import onnxruntime
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
@@ -25,7 +26,7 @@ from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, recorded_plays
-from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, read_nir
+from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, onnx_session, read_nir
 from switchmt_snn.runs.evaluations import evaluation_name
 from switchmt_snn.runs.files import file_name, json_text, write_atomically, written_whole
 from switchmt_snn.runs.folder import RunFolder
@@ -263,12 +264,7 @@ def evaluate_exported(
     folder = open_run(run, to_write=True)
     agent = load_agent(folder.path, checkpoint, "cpu")
     suite, config = agent.suite, agent.config
-    played = _runtime(folder, runtime, suite, config)
-    if played.step != agent.step:
-        raise ExportError(
-            f"the exported files are of step {played.step}, expected {agent.step} (the {checkpoint} checkpoint); "
-            f"run switchmt-snn export {folder.path} again"
-        )
+    played = exported_as(agent, folder, runtime, checkpoint)
     compared = ComparedAgent(played, agent)
     settings = replace(config.evaluation, **protocol)
     tasks = None if task is None else (suite.names[suite.index(task)],)
@@ -282,6 +278,30 @@ def evaluate_exported(
     path.parent.mkdir(exist_ok=True)
     write_atomically(path, json_text(facts, indent=1).encode())
     return evaluation, share
+
+
+def exported_as(agent: Agent, folder: RunFolder, runtime: str, checkpoint: str) -> OnnxAgent | NirAgent:
+    """A run's exported files as an agent, if they have the weights of the trained one.
+
+    Raises:
+        ExportError: an unknown runtime; the run was not exported, or its files are of another training step.
+    """
+    played = _runtime(folder, runtime, agent.suite, agent.config)
+    if played.step != agent.step:
+        raise ExportError(
+            f"the exported files are of step {played.step}, expected {agent.step} (the {checkpoint} checkpoint); "
+            f"run switchmt-snn export {folder.path} again"
+        )
+    return played
+
+
+def step_session(folder: RunFolder) -> onnxruntime.InferenceSession:
+    """``step.onnx`` of a run: one simulation step, with its spikes.
+
+    Raises:
+        ExportError: the run was not exported.
+    """
+    return onnx_session(_exported(folder, "step.onnx", "--onnx"))
 
 
 def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads: int = 1) -> OnnxAgent | NirAgent:

@@ -11,16 +11,19 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import onnxruntime
 import torch
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.watching import Insight
-from switchmt_snn.errors import ExportError
+from switchmt_snn.export.export_run import exported_as, step_session
+from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.parity.activity import active_neurons
-from switchmt_snn.export.parity.compare import Trace
-from switchmt_snn.export.runtimes.agents import existing_only
+from switchmt_snn.export.parity.compare import Trace, trace_nir, trace_onnx
+from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent, encode, existing_only
 from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.run import load_agent
+from switchmt_snn.spiking.folding import FoldedNetwork
 
 Tracer = Callable[[npt.NDArray[Any], int, int], Trace]
 """Observations ``[B, *shape]``, a task and the seed of a random encoding -> Q-values and spikes."""
@@ -66,20 +69,48 @@ class Watched:
 
 
 def watched_agent(run: str | Path | None = None, runtime: str = "torch", checkpoint: str = "last") -> Watched:
-    """A run's agent, watched.
+    """A run's agent, or its exported files, watched.
 
     Args:
         run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
-        runtime: ``torch``: the trained network.
-        checkpoint: ``last`` or ``best``.
+        runtime: ``torch``: the trained network. ``onnx``: ``export/decision.onnx``, with the spikes of
+            ``export/step.onnx``. ``nir``: ``export/TASK.nir`` in the reference interpreter.
+        checkpoint: ``last`` or ``best``; exported files must be of the same training step.
 
     Raises:
-        ExportError: an unknown runtime.
+        ExportError: an unknown runtime; the run was not exported, or its files are of another training step.
     """
     folder = open_run(run)
+    agent = load_agent(folder.path, checkpoint, "cpu")
     if runtime == "torch":
-        return Watched(load_agent(folder.path, checkpoint, "cpu"), trace_network, runtime)
-    raise ExportError(f"the runtime is {runtime!r}, expected torch")
+        return Watched(agent, trace_network, runtime)
+    played, network = exported_as(agent, folder, runtime, checkpoint), fold_agent(agent)
+    if isinstance(played, NirAgent):
+        return Watched(agent, lambda agent: tracer_of_nir(agent, network, played), runtime)
+    step = step_session(folder) if network.spiking else None
+    return Watched(agent, lambda agent: tracer_of_onnx(agent, network, played, step), runtime)
+
+
+def tracer_of_nir(agent: Agent, network: FoldedNetwork, played: NirAgent) -> Tracer:
+    """NIR files in the reference interpreter."""
+
+    def trace(observations: npt.NDArray[Any], task: int, seed: int) -> Trace:
+        encoded_TB = encode(agent.suite, agent.config, observations, seed)
+        return trace_nir(network, played.interpreters[agent.suite.names[task]], encoded_TB)
+
+    return trace
+
+
+def tracer_of_onnx(
+    agent: Agent, network: FoldedNetwork, played: OnnxAgent, step: onnxruntime.InferenceSession | None
+) -> Tracer:
+    """``decision.onnx``, with the spikes of ``step.onnx``; without it there are none."""
+
+    def trace(observations: npt.NDArray[Any], task: int, seed: int) -> Trace:
+        encoded_TB = encode(agent.suite, agent.config, observations, seed)
+        return trace_onnx(network, played, step, observations, encoded_TB, task)
+
+    return trace
 
 
 def trace_network(agent: Agent) -> Tracer:

@@ -132,9 +132,8 @@ def trace_torch(agent: Agent, observations: npt.NDArray[Any], task: int, seed: i
     return Trace(activity.q_BA, activity.by_layer if agent.network.spiking else {})
 
 
-def trace_nir(network: FoldedNetwork, graph: nir.NIRGraph, encoded_TB: Float) -> Trace:
+def trace_nir(network: FoldedNetwork, interpreter: NirInterpreter, encoded_TB: Float) -> Trace:
     """A NIR graph in the reference interpreter."""
-    interpreter = NirInterpreter(graph, reset=str(graph.metadata["reset"]))
     names = {layer.name: f"{layer.name}_neurons" for layer in network.layers}
     outputs, recorded = interpreter.run(encoded_TB, list(names.values()))
     return Trace(network.readout(outputs), {name: _flat(recorded[node]) > 0 for name, node in names.items()})
@@ -227,7 +226,8 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
             elif result.runtime == "onnx, one task" and own is not None:
                 result.add(expected, trace_onnx(network, own, None, chunk, encoded_TB, task))
             elif exports.graphs is not None:
-                result.add(expected, trace_nir(network, exports.graphs[name], encoded_TB))
+                interpreter = NirInterpreter(exports.graphs[name], reset=str(exports.graphs[name].metadata["reset"]))
+                result.add(expected, trace_nir(network, interpreter, encoded_TB))
         return results
 
     totals = [Comparison(runtime, name) for runtime in runtimes]

@@ -29,12 +29,15 @@ class PlayOptions:
     """Share of random actions. Default: the run's evaluation.epsilon."""
     checkpoint: Literal["last", "best"] = "last"
     """Which weights."""
-    runtime: Literal["torch"] = "torch"
-    """What plays. torch: the trained network."""
+    runtime: Literal["torch", "onnx", "nir"] = "torch"
+    """What plays. torch: the trained network. onnx: the run's ONNX files in onnxruntime. nir: its NIR files in the NIR
+    interpreter."""
     out: Path | None = None
-    """FILE.mp4, FILE.gif, or a folder for PNG frames. Default: RUN/films/TASK-step-N.mp4."""
+    """FILE.mp4, FILE.gif, or a folder for PNG frames. Default: RUN/films/TASK-step-N.mp4; with --live none."""
     fps: float | None = None
     """Frames (decisions) per second. Default: real time for Atari, else 15."""
+    live: bool = False
+    """Show the film in a window while it is made."""
     json: bool = False
     """Print the film's facts as JSON."""
 
@@ -47,7 +50,10 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.export.watching import watched_agent
     from switchmt_snn.runs.packing import open_run
     from switchmt_snn.viewing.film.film import FilmSettings, make_film
+    from switchmt_snn.viewing.film.window import Window, require_screen
 
+    if options.live:
+        require_screen()
     path = open_run(run, to_write=True).path
     settings = FilmSettings(options.task, options.episodes, options.seconds, options.fps).require()
     agent = watched_agent(path, options.runtime, options.checkpoint)
@@ -55,17 +61,24 @@ def command(argv: list[str]) -> int:
     config = agent.agent.config
     evaluation = replace(config.evaluation, episodes=options.episodes or 1, num_envs=1, **changes)
     names = tuple(agent.suite.names[agent.suite.index(name)] for name in options.task) or agent.suite.names[:1]
-    out = options.out or path / "films" / f"{file_name(*names)}-step-{agent.step}.mp4"
-    film = make_film(agent, EvaluationProtocol.of(evaluation, config.tasks), settings, out, note=_say)
+    out = options.out
+    if out is None and not options.live:
+        runtime = "" if options.runtime == "torch" else f"-{options.runtime}"
+        out = path / "films" / f"{file_name(*names)}-step-{agent.step}{runtime}.mp4"
+    protocol = EvaluationProtocol.of(evaluation, config.tasks)
+    film = make_film(agent, protocol, settings, out, Window if options.live else None, note=_say)
+    if film.stopped:
+        _say(f"stopped after {film.frames:,} frames, which are kept")
     if options.json:
-        print(json_text({"film": str(film.path), **film.facts}))
-        return 0
+        print(json_text({"film": None if film.path is None else str(film.path), **film.facts}))
+        return 130 if film.stopped else 0
     for lane in film.facts["tasks"]:
         scores = ", ".join(f"{episode['score']:g}" for episode in lane["episodes"])
         print(f"{lane['task']}: {'returns ' + scores if scores else 'no episode ended'}")
     print(f"{film.frames:,} frames at {film.facts['fps']:g} per second")
-    print(film.path)
-    return 0
+    if film.path is not None:
+        print(film.path)
+    return 130 if film.stopped else 0
 
 
 def _say(text: str) -> None:

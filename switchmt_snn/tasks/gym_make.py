@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -117,6 +118,8 @@ def make_environment(name: str, wrappers: Sequence[str] = (), pictured: bool = F
 
 def _registered(name: str, env_id: str, pictured: bool) -> Env:
     try:
+        if pictured:
+            os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame greets on stdout
         options: dict[str, Any] = {"render_mode": PICTURES} if pictured and _draws(env_id) else {}
         env: Env = gymnasium.make(env_id, **options)
     except gymnasium.error.DependencyNotInstalled as error:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import itertools
 import json
+import signal
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,18 +22,24 @@ from PIL import Image
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import EvaluationProtocol, evaluate_agent
+from switchmt_snn.cli import main
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.errors import ConfigError, MissingExtraError, RunFolderError
+from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.export.formats.files import nir_graphs
+from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.activity import active_neurons
-from switchmt_snn.export.watching import Watched, trace_network
+from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent, onnx_session
+from switchmt_snn.export.watching import Watched, trace_network, tracer_of_nir, tracer_of_onnx
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import make_suite
-from switchmt_snn.viewing.film import sinks
-from switchmt_snn.viewing.film.canvas import SPIKE
+from switchmt_snn.viewing.film import sinks, window
+from switchmt_snn.viewing.film.canvas import SPIKE, number
 from switchmt_snn.viewing.film.film import Film, FilmSettings, make_film
 from switchmt_snn.viewing.film.layout import layouts
+from switchmt_snn.viewing.film.moments import moments, rehearse
 from switchmt_snn.viewing.film.panels import raster_boxes
 from switchmt_snn.viewing.film.raster import TimeAxis, row_pixels
 from tests.conftest import small_config
@@ -96,16 +104,16 @@ def test_the_spikes_that_are_drawn_are_those_of_activity(tasks: tuple[str, ...],
     rows = rows_of(film)
     assert film.frames == 12
     fired = 0
-    for number, name in enumerate(tasks):
-        task, lane = agent.suite.index(name), film.facts["tasks"][number]
+    for place, name in enumerate(tasks):
+        task, lane = agent.suite.index(name), film.facts["tasks"][place]
         own = [row for row in rows if row["task"] == name]
-        layout = layouts(len(tasks), 2, len(lane["layers"]))[number]
+        layout = layouts(len(tasks), 2, len(lane["layers"]))[place]
         axis = TimeAxis(layout.spikes.left, layout.spikes.width, 3)
         rasters = raster_boxes(layout.spikes, tuple(lane["layers"]))
         expected: dict[str, list[npt.NDArray[np.bool_]]] = {layer: [] for layer in lane["layers"]}
         for row, observation in zip(own, observed(agent, task, play.seed, own), strict=True):
-            place = (play.seed, task, int(row["episode"]), int(row["step"]))
-            seed = int(np.random.default_rng(place).integers(2**62))
+            drawn = (play.seed, task, int(row["episode"]), int(row["step"]))
+            seed = int(np.random.default_rng(drawn).integers(2**62))
             activity = active_neurons(agent.agent, observation, task, seed)
             for layer, values in activity.by_layer.items():
                 expected[layer].append(values[:, 0, lane["layers"][layer]["drawn"]])
@@ -190,16 +198,24 @@ def test_a_video_has_every_frame_in_order(ending: str, tmp_path: Path) -> None:
     assert [len(gains) for gains in facts["tasks"][0]["gains"].values()] == [1, 1]
 
 
-def test_rows_are_neurons_that_vary(tmp_path: Path) -> None:
+def test_the_neurons_that_are_drawn_vary_and_differ() -> None:
     agent = watched(MINATAR)
-    film = make_film(agent, protocol(agent), FilmSettings(("asterix",), seconds=2), tmp_path / "frames")
-    rows = rows_of(film)
-    observations = observed(agent, 1, 5, rows)
-    by_layer = [active_neurons(agent.agent, one, 1, 0).by_layer["conv1"][:, 0].sum(axis=0) for one in observations]
-    variance_N = np.var(by_layer, axis=0)
-    drawn = film.facts["tasks"][0]["layers"]["conv1"]["drawn"]
-    assert drawn == sorted(set(drawn))
-    assert variance_N[drawn].mean() > 3 * variance_N.mean()
+    play = protocol(agent)
+    rehearsal = rehearse(agent, (0, 1), play, decisions=20)
+    spikes_KDN = np.asarray(
+        [
+            [moment.insight.active["conv1"].sum(axis=0) for moment in itertools.islice(moments(agent, task, play), 20)]
+            for task in (0, 1)
+        ]
+    )
+    variance_N = spikes_KDN.var(axis=1).sum(axis=0)
+    kinds = {tuple(spikes) for spikes in spikes_KDN.reshape(40, -1).T}
+    drawn = rehearsal.rows("conv1", 10)
+    assert drawn.tolist() == sorted(drawn)
+    assert len({tuple(spikes_KDN[:, :, neuron].ravel()) for neuron in drawn}) == 10 < len(kinds)
+    assert (rehearsal.timesteps, rehearsal.neurons["conv1"]) == (3, 1024)
+    best = sorted({(-variance_N[neuron], tuple(spikes_KDN[:, :, neuron].ravel())) for neuron in range(1024)})
+    assert np.allclose(sorted(-variance_N[drawn]), [variance for variance, _ in best[:10]])
 
 
 def test_what_is_missing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,7 +238,7 @@ def test_what_is_missing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
         (FilmSettings(fps=1000), "film.mp4", ConfigError, "--fps is 1000"),
         (FilmSettings(episodes=0), "film.mp4", ConfigError, "--episodes is 0"),
         (FilmSettings(("Acrobot-v1",) * 2), "film.mp4", ConfigError, "each once"),
-        (FilmSettings(seconds=1), ".", RunFolderError, "not empty"),
+        (FilmSettings(seconds=1), ".", RunFolderError, "is not an empty folder"),
     ],
 )
 def test_what_cannot_be_filmed_is_refused(
@@ -297,3 +313,111 @@ def test_pictures_change_nothing_that_is_played(tasks: dict[str, Any], shape: tu
             play.step(np.asarray([step % 2]))
         assert np.array_equal(plain.observations, pictured.observations)
     assert len(seen) > 4
+
+
+def exported(agent: Watched, runtime: str) -> Watched:
+    network = fold_agent(agent.agent)
+    if runtime == "nir":
+        nir_agent = NirAgent(nir_graphs(network), agent.suite, agent.agent.config)
+        return Watched(agent.agent, lambda own: tracer_of_nir(own, network, nir_agent), runtime)
+    onnx_agent = OnnxAgent(decision_model(network).SerializeToString(), agent.suite, agent.agent.config)
+    step = onnx_session(step_model(network).SerializeToString())
+    return Watched(agent.agent, lambda own: tracer_of_onnx(own, network, onnx_agent, step), runtime)
+
+
+@pytest.mark.parametrize("runtime", ["onnx", "nir"])
+@pytest.mark.parametrize("encoding", ["direct", "rate"])
+def test_exported_files_play_and_fire_like_the_network(runtime: str, encoding: str, tmp_path: Path) -> None:
+    agent = watched(MINATAR, encoding=encoding)
+    settings = FilmSettings(("asterix",), seconds=0.4)
+    rows = []
+    for one, folder in ((agent, "torch"), (exported(agent, runtime), runtime)):
+        rows.append(rows_of(make_film(one, protocol(agent), settings, tmp_path / folder)))
+    assert len(rows[0]) == len(rows[1]) == 6
+    for expected, seen in zip(*rows, strict=True):
+        for name in expected:
+            if name.startswith(("q_", "advantage_")):
+                assert float(seen[name]) == pytest.approx(float(expected[name]), abs=1e-4), name
+            else:
+                assert seen[name] == expected[name], name
+    assert sum(int(row[f"spikes_{layer}"]) for row in rows[1] for layer in ("conv1", "hidden")) > 20
+
+
+def test_without_a_screen_a_window_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in window.SCREENS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(window.sys, "platform", "linux")
+    with pytest.raises(SystemExit) as stop:
+        main(["play", "runs/none", "--live"])
+    assert stop.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(
+        "switchmt-snn: --live found no screen (DISPLAY and WAYLAND_DISPLAY are not set), expected one"
+    )
+    assert err.count("\n") == 1
+
+
+def test_a_window_shows_every_frame_until_it_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SDL's dummy driver is a screen without anybody who looks."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    shown: list[npt.NDArray[np.uint8]] = []
+
+    class Watched3(window.Window):
+        def add(self, image: Image.Image) -> None:
+            if len(shown) == 2:
+                pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_q))
+            try:
+                super().add(image)
+            finally:
+                shown.append(pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1))
+
+    agent = watched(CARTPOLE)
+    film = make_film(agent, protocol(agent), FilmSettings(seconds=2, fps=100), tmp_path / "frames", Watched3)
+    assert film.frames == len(rows_of(film)) == len(shown) == 3
+    assert not film.stopped
+    for index, pixels in enumerate(shown):
+        assert np.array_equal(pixels, np.asarray(Image.open(tmp_path / "frames" / f"frame_{index:06}.png")))
+    only_shown = make_film(agent, protocol(agent), FilmSettings(seconds=0.05, fps=60), None, window.Window)
+    assert (only_shown.path, only_shown.frames) == (None, 3)
+
+
+def test_ctrl_c_keeps_the_film_so_far(tmp_path: Path) -> None:
+    agent = watched(CARTPOLE)
+
+    class Interrupting:
+        def __init__(self, size: tuple[int, int], fps: float) -> None:
+            self.frames = 0
+
+        def add(self, image: Image.Image) -> None:
+            self.frames += 1
+            if self.frames == 3:
+                signal.raise_signal(signal.SIGINT)
+
+        def close(self) -> None:
+            pass
+
+        discard = close
+
+    film = make_film(agent, protocol(agent), FilmSettings(seconds=60), tmp_path / "film.mp4", Interrupting)
+    assert film.stopped
+    assert film.frames == len(rows_of(film)) == len(decoded(tmp_path / "film.mp4", (1280, 720))) == 3
+
+
+def test_numbers_are_short() -> None:
+    alone = {
+        0.0: "0",
+        30.0: "30",
+        -21.0: "-21",
+        12345.0: "12,345",
+        0.0123: "0.012",
+        1.234: "1.23",
+        98.23: "98.2",
+    }
+    assert {value: number(value) for value in alone} == alone
+    beside = [(98.234, 7.0, "98.23"), (0.5, 0.031, "0.5000"), (1234.5, 400.0, "1,234"), (0.1, 0.0, "0.100")]
+    assert [number(value, span) for value, span, _ in beside] == [text for _, _, text in beside]
+    assert (number(1e-5), number(-0.0)) == ("1e-05", "0")

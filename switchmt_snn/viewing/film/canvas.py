@@ -7,6 +7,7 @@ colour says is also said by a form or a text.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,13 +154,18 @@ def shortened(text: str, size: int, width: int | None) -> str:
     return text.rstrip() + "..."
 
 
-def number(value: float) -> str:
-    """Three digits that count, or whole ones: 0.0123, 1.23, 123, 12,345."""
+def number(value: float, span: float | None = None) -> str:
+    """A number as short as it can be told: a whole one without decimals, else three digits that count.
+
+    ``span`` gives the decimals instead: enough to tell values apart that differ by a hundredth of it.
+    """
+    if span is not None:
+        decimals = min(5, max(0, 2 - math.floor(math.log10(span)))) if span > 0 else 3
+        return f"{value:,.{decimals}f}"
     if value == 0:
         return "0"
-    size = abs(value)
-    if size >= 100:
+    if value == round(value):
         return f"{value:,.0f}"
-    if size >= 10:
-        return f"{value:.1f}"
-    return f"{value:.2f}" if size >= 0.995 else f"{value:.3g}" if size < 0.1 else f"{value:.3f}"
+    size = abs(value)
+    decimals = 0 if size >= 100 else 1 if size >= 10 else 2 if size >= 1 else 3
+    return f"{value:,.{decimals}f}" if size >= 0.001 else f"{value:.2g}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import time
 from collections import deque
@@ -12,10 +11,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from switchmt_snn.acting.episodes import EpisodeScore
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.acting.watching import WatchedAgent, gains_of
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.runs.signals import stop_requests
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.viewing.film import panels
 from switchmt_snn.viewing.film.canvas import MUTED, SMALL, Canvas
@@ -24,7 +26,7 @@ from switchmt_snn.viewing.film.moments import Moment, Rehearsal, moments, rehear
 from switchmt_snn.viewing.film.panels import Names, Past, Seen
 from switchmt_snn.viewing.film.raster import TimeAxis, rows_that_fit
 from switchmt_snn.viewing.film.record import Record
-from switchmt_snn.viewing.film.sinks import Sink, check_sink, open_sink
+from switchmt_snn.viewing.film.sinks import Sink, StopFilm, check_sink, open_sink
 
 DEFAULT_SECONDS = 60.0
 DEFAULT_FPS = 15.0
@@ -78,11 +80,13 @@ class Film:
     Attributes:
         path: the video, or the folder of frames; None if it was only shown.
         frames: how many.
+        stopped: whether Ctrl-C ended it early; what was filmed by then is kept.
         facts: the content of its JSON file.
     """
 
     path: Path | None
     frames: int
+    stopped: bool
     facts: dict[str, Any]
 
 
@@ -102,7 +106,7 @@ class Lane:
             task=suite.names[task],
             actions=suite.action_names,
             valid_A=suite.valid_actions_KA[task],
-            about=f"{settings.method}, T = {settings.timesteps}, step {agent.step:,}, {agent.runtime}",
+            about=(settings.method, f"step {agent.step:,}", f"T = {settings.timesteps}, {agent.runtime}"),
             gains=gains_of(agent.agent, task),
             rows={name: rehearsal.rows(name, rows_that_fit(box.height)) for name, box in boxes.items()},
             neurons=rehearsal.neurons,
@@ -138,7 +142,7 @@ class Lane:
         """Draw what is seen."""
         layout, names, seen = self.layout, self.names, self.seen
         assert seen is not None, "drawn before the first decision"
-        panels.draw_head(canvas, layout.head, names, seen.moment)
+        panels.draw_head(canvas, layout.head, names, seen.moment, layout.compact)
         panels.draw_game(canvas, layout.game, seen.moment)
         if names.gains:
             panels.draw_gains(canvas, layout.gains, names, layout.compact)
@@ -154,7 +158,7 @@ def make_film(
     protocol: EvaluationProtocol,
     settings: FilmSettings,
     out: Path | None,
-    shown: Sink | None = None,
+    shown: Callable[[tuple[int, int], float], Sink] | None = None,
     note: Callable[[str], None] = lambda text: None,
 ) -> Film:
     """Play a run's agent and film it.
@@ -165,7 +169,7 @@ def make_film(
         settings: tasks, length and speed.
         out: ``.mp4``, ``.gif``, or a name without ending for a folder of PNG frames; numbers go beside it. None keeps
             nothing.
-        shown: also gets every frame: a window.
+        shown: opens what also gets every frame, from the frames' size and the speed: a window.
         note: told in a line what goes on.
 
     Raises:
@@ -187,20 +191,17 @@ def make_film(
             play = closing.enter_context(contextlib.closing(moments(agent, task, protocol, episodes)))
             lanes.append(Lane(agent, task, play, layout, rehearsal))
         size = canvas_size(len(tasks))
-        sinks = [*([shown] if shown is not None else []), *([open_sink(out, size, fps)] if out is not None else [])]
+        window = None if shown is None else shown(size, fps)
+        sink = None if out is None else open_sink(out, size, fps)
         record = None if out is None else Record(*_beside(out), suite.action_names, tuple(rehearsal.order))
-        director = _Director(lanes, protocol, sinks, record, note, most_frames)
+        director = _Director(lanes, protocol, window, sink, record, note)
         try:
-            director.run()
-        except KeyboardInterrupt:
-            _finish(director, agent, out, fps)
-            note(f"stopped after {director.frames:,} frames, which are kept")
-            raise
+            with stop_requests() as stop:
+                director.run(most_frames, stop)
         except BaseException:
-            for sink in sinks:
-                sink.discard()
-            if record is not None:
-                record.discard()
+            for unfinished in (window, sink, record):
+                if unfinished is not None:
+                    unfinished.discard()
             raise
         return _finish(director, agent, out, fps)
 
@@ -212,36 +213,46 @@ class _Director:
         self,
         lanes: list[Lane],
         protocol: EvaluationProtocol,
-        sinks: list[Sink],
+        window: Sink | None,
+        sink: Sink | None,
         record: Record | None,
         note: Callable[[str], None],
-        most_frames: int | None,
     ) -> None:
-        self.lanes, self.protocol, self.sinks, self.record = lanes, protocol, sinks, record
-        self.note, self.most_frames = note, most_frames
+        self.lanes, self.protocol = lanes, protocol
+        self.window, self.sink, self.record, self.note = window, sink, record, note
         self.frames = 0
+        self.stopped = False
 
-    def run(self) -> None:
-        """Make the frames."""
-        size = canvas_size(len(self.lanes))
+    def run(self, most_frames: int | None, stop: Callable[[], bool]) -> None:
+        """Make the frames; ``stop`` is asked before each."""
         began = said = time.monotonic()
-        for frame in itertools.count() if self.most_frames is None else range(self.most_frames):
+        while self.frames != most_frames and not stop():
             moments_now = [(lane, lane.advance()) for lane in self.lanes if not lane.over]
             if all(moment is None for _, moment in moments_now):
-                break
-            canvas = Canvas(*size)
-            for lane in self.lanes:
-                lane.draw(canvas)
-            _draw_foot(canvas, self.protocol)
-            for sink in self.sinks:
-                sink.add(canvas.image)
+                return
+            image = self._drawn()
+            if self.sink is not None:
+                self.sink.add(image)
             for lane, moment in moments_now:
                 if moment is not None and self.record is not None:
-                    self.record.add(frame, lane.names, moment)
+                    self.record.add(self.frames, lane.names, moment)
             self.frames += 1
+            if self.window is not None:
+                try:
+                    self.window.add(image)
+                except StopFilm:
+                    return
             if time.monotonic() - said > SAY_EVERY_S:
                 said = time.monotonic()
-                self.note(_progress(self.frames, self.most_frames, said - began))
+                self.note(_progress(self.frames, most_frames, said - began))
+        self.stopped = stop()
+
+    def _drawn(self) -> Image.Image:
+        canvas = Canvas(*canvas_size(len(self.lanes)))
+        for lane in self.lanes:
+            lane.draw(canvas)
+        _draw_foot(canvas, self.protocol)
+        return canvas.image
 
 
 def _progress(frames: int, most: int | None, wall_s: float) -> str:
@@ -292,8 +303,9 @@ def _finish(director: _Director, agent: WatchedAgent, out: Path | None, fps: flo
         "actions": list(agent.suite.action_names),
         "tasks": lanes,
     }
-    for sink in director.sinks:
-        sink.close()
+    for sink in (director.window, director.sink):
+        if sink is not None:
+            sink.close()
     if director.record is not None:
         director.record.close(facts)
-    return Film(out, director.frames, facts)
+    return Film(out, director.frames, director.stopped, facts)

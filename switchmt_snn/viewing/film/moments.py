@@ -124,21 +124,46 @@ def rehearse(
     """Play the first decisions of each task, and rank the neurons.
 
     A neuron that never fires and one that fires at every step show nothing; what counts is the variance of its number
-    of spikes per decision, over the decisions of all tasks. Of equal ones the one that fires more comes first.
+    of spikes per decision, within a task, added up over the tasks. Of equal ones the one that fires more comes first,
+    and of those that had the same number of spikes at every decision all but one come after all others.
     """
-    sums: dict[str, npt.NDArray[np.float64]] = {}
-    squares: dict[str, npt.NDArray[np.float64]] = {}
-    counted, timesteps = 0, 0
+    layers: dict[str, _Counts] = {}
+    timesteps = 0
     for task in tasks:
         for moment in itertools.islice(moments(agent, task, protocol), decisions):
-            counted += 1
             for name, active_TN in moment.insight.active.items():
                 timesteps = len(active_TN)
-                spikes_N = active_TN.sum(axis=0).astype(np.float64)
-                sums[name] = sums.get(name, 0) + spikes_N
-                squares[name] = squares.get(name, 0) + spikes_N**2
-    order = {}
-    for name, sum_N in sums.items():
-        variance_N = squares[name] / counted - (sum_N / counted) ** 2
-        order[name] = np.lexsort((-sum_N, -variance_N.round(12)))
-    return Rehearsal(order, {name: len(sum_N) for name, sum_N in sums.items()}, timesteps)
+                layers.setdefault(name, _Counts(active_TN.shape[1])).add(task, active_TN.sum(axis=0))
+    return Rehearsal(
+        {name: counts.order() for name, counts in layers.items()},
+        {name: counts.neurons for name, counts in layers.items()},
+        timesteps,
+    )
+
+
+class _Counts:
+    """Spikes per decision of a layer's neurons: sums, squares and a fingerprint, no single decision."""
+
+    def __init__(self, neurons: int) -> None:
+        self.neurons = neurons
+        self._sums: dict[int, npt.NDArray[np.float64]] = {}
+        self._squares: dict[int, npt.NDArray[np.float64]] = {}
+        self._decisions: dict[int, int] = {}
+        self._alike_N = np.zeros(neurons, np.uint64)
+
+    def add(self, task: int, spikes_N: npt.NDArray[np.int64]) -> None:
+        self._sums[task] = self._sums.get(task, 0) + spikes_N.astype(np.float64)
+        self._squares[task] = self._squares.get(task, 0) + spikes_N.astype(np.float64) ** 2
+        self._decisions[task] = self._decisions.get(task, 0) + 1
+        self._alike_N = self._alike_N * np.uint64(0x100000001B3) + spikes_N.astype(np.uint64)  # modulo 2^64
+
+    def order(self) -> npt.NDArray[np.int64]:
+        variance_N, sum_N = np.zeros(self.neurons), np.zeros(self.neurons)
+        for task, count in self._decisions.items():
+            variance_N += self._squares[task] / count - (self._sums[task] / count) ** 2
+            sum_N += self._sums[task]
+        best_first = np.lexsort((-sum_N, -variance_N.round(12)))
+        _, firsts = np.unique(self._alike_N[best_first], return_index=True)
+        is_first = np.zeros(self.neurons, np.bool_)
+        is_first[firsts] = True
+        return np.concatenate([best_first[is_first], best_first[~is_first]])

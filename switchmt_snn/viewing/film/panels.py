@@ -58,7 +58,7 @@ class Names:
         task: name.
         actions: by index of a Q-value.
         valid_A: which of them exist.
-        about: the agent in a line.
+        about: the agent, the part that stays where there is little room last.
         gains: of the dendrites by stream ``[N]`` or ``[1]``.
         rows: indices of the drawn neurons by layer.
         neurons: of each layer.
@@ -68,7 +68,7 @@ class Names:
     task: str
     actions: tuple[str, ...]
     valid_A: npt.NDArray[np.bool_]
-    about: str
+    about: tuple[str, ...]
     gains: dict[str, npt.NDArray[np.float32]]
     rows: dict[str, npt.NDArray[np.int64]]
     neurons: dict[str, int]
@@ -83,7 +83,7 @@ class Seen:
     past: deque[Past] = field(default_factory=deque)
 
 
-def draw_head(canvas: Canvas, box: Box, names: Names, moment: Moment) -> None:
+def draw_head(canvas: Canvas, box: Box, names: Names, moment: Moment, compact: bool) -> None:
     """Task and agent; score, episode and step."""
     score = number(moment.score)
     canvas.text((box.right, box.top - 6), score, LARGE, anchor="ra")
@@ -91,8 +91,8 @@ def draw_head(canvas: Canvas, box: Box, names: Names, moment: Moment) -> None:
     canvas.text((box.right, box.top + 38), label, SMALL, MUTED, "ra")
     where = f"episode {moment.episode} · step {moment.step:,}"
     canvas.text((box.left, box.top), names.task, TITLE, width=box.width - 150)
-    line = f"{where} · {names.about}"
-    canvas.text((box.left, box.top + 34), line, SMALL, MUTED, width=box.width - 150)
+    line = f"{where} · {names.about[-1] if compact else ', '.join(names.about)}"
+    canvas.text((box.left, box.top + 34), line, SMALL, MUTED, width=box.width - 110)
 
 
 def draw_game(canvas: Canvas, box: Box, moment: Moment) -> None:
@@ -165,7 +165,7 @@ def draw_values(canvas: Canvas, box: Box, names: Names, seen: Seen, compact: boo
     canvas.text((title.left, title.top), "Q-values", SMALL, MUTED)
     how = f"at random: {chosen}" if moment.random else f"chosen: {chosen}"
     canvas.text((title.right, title.top), how, SMALL, CHOSEN, "ra", width=title.width - 64)
-    below = 22 if compact else 66
+    below = 40 if compact else 66
     high = min(34, (rest.height - below) // len(exists))
     size = NORMAL if high >= 20 else SMALL if high >= 14 else 11
     name_wide = 62 if compact else 92
@@ -191,7 +191,7 @@ def draw_values(canvas: Canvas, box: Box, names: Names, seen: Seen, compact: boo
             canvas.diamond(across(q), middle, 6, CHOSEN)
         else:
             canvas.dot(across(q), middle, 5 if is_chosen else 3.5, colour)
-        canvas.text((rest.right, middle), number(q), size, colour, "rm")
+        canvas.text((rest.right, middle), number(q, top - low), size, colour, "rm")
     if insight.value is not None:
         x = across(insight.value)
         canvas.line([(x, rest.top), (x, bottom)], VALUE, 2)
@@ -202,20 +202,19 @@ def _draw_below_values(
     canvas: Canvas, box: Box, names: Names, moment: Moment, span: tuple[float, float], compact: bool
 ) -> None:
     """The axis' ends, and value and advantage as numbers."""
-    value, advantage_A = moment.insight.value, moment.insight.advantage_A
-    ends = None if value is None or not compact else f"value {number(value)}"
-    canvas.text((box.left, box.top + 4), number(span[0]), SMALL, MUTED)
-    canvas.text((box.right, box.top + 4), number(span[1]), SMALL, MUTED, "ra")
-    if ends is not None:
-        canvas.text((box.left + box.width / 2, box.top + 4), ends, SMALL, VALUE, "ma")
+    value, advantage_A, wide = moment.insight.value, moment.insight.advantage_A, span[1] - span[0]
+    canvas.text((box.left, box.top + 4), number(span[0], wide), SMALL, MUTED)
+    canvas.text((box.right, box.top + 4), number(span[1], wide), SMALL, MUTED, "ra")
+    if value is not None and compact:
+        canvas.text((box.left + box.width / 2, box.top + 20), f"value {number(value, wide)}", SMALL, VALUE, "ma")
     if value is None or advantage_A is None or compact:
         return
     left, right = box.left - 100, box.right + 56
     canvas.text((left, box.top + 28), "value (line)", SMALL, VALUE)
-    canvas.text((right, box.top + 28), number(value), SMALL, VALUE, "ra")
+    canvas.text((right, box.top + 28), number(value, wide), SMALL, VALUE, "ra")
     advantage = float(advantage_A[moment.action])
     canvas.text((left, box.top + 46), f"advantage of {names.actions[moment.action]}", SMALL, CHOSEN, width=180)
-    canvas.text((right, box.top + 46), signed(advantage), SMALL, CHOSEN, "ra")
+    canvas.text((right, box.top + 46), signed(advantage, wide), SMALL, CHOSEN, "ra")
 
 
 def _span(past: Sequence[Past]) -> tuple[float, float]:
@@ -330,6 +329,6 @@ def _draw_curve(
     canvas.dot(*points[0], 2.5, colour)
 
 
-def signed(value: float) -> str:
+def signed(value: float, span: float | None = None) -> str:
     """A number with its sign."""
-    return f"+{number(value)}" if value > 0 else number(value)
+    return f"+{number(value, span)}" if value > 0 else number(value, span)

@@ -22,6 +22,10 @@ CODERS = {
 """ffmpeg's options by the file's ending."""
 
 
+class StopFilm(Exception):
+    """Whoever watches has seen enough; what was filmed is kept."""
+
+
 class Sink(Protocol):
     """Takes frames in order."""
 
@@ -132,13 +136,18 @@ def check_sink(path: Path) -> None:
     Raises:
         ConfigError: another ending than .mp4, .gif or none.
         MissingExtraError: ffmpeg is needed and not installed.
+        RunFolderError: a folder that holds files, which frames would be mixed with.
     """
     if path.suffix in CODERS:
         _ffmpeg()
+        if path.is_dir():
+            raise ConfigError(f"--out is {path}, which is a folder, expected the name of a video file")
     elif path.suffix:
         raise ConfigError(
             f"--out is {path}, expected a name that ends in .mp4 or .gif, or without ending: a folder of PNG frames"
         )
+    elif path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise RunFolderError(f"{path} is not an empty folder, expected one for frames, or a new name; change --out")
 
 
 def open_sink(path: Path, size: tuple[int, int], fps: float) -> Sink:
