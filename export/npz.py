@@ -79,7 +79,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Array:
         if dtype.hasobject:
             raise ValueError(f"{info.filename} holds objects")
         size = math.prod(shape) * dtype.itemsize
-        content = stream.read(size + 1)
+        content = bytearray(stream.read(size + 1))  # arrays that can be written to, as NumPy gives them
         if len(content) != size or stream.tell() != info.file_size:
             raise ValueError(f"{info.filename} has {len(content):,} bytes or more, its header says {size:,}")
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
