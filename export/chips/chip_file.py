@@ -37,6 +37,9 @@ def read_chip(raw: Any, where: str) -> Chip:
     limits = file.section("limits", optional=None)
     if not limits.raw:
         raise file.wrong("limits", "at least one limit")
+    for resource in limits.raw:
+        if not isinstance(resource, str):
+            raise ConfigError(f"{where}: limits has the key {resource!r:.40}, expected the name of a resource")
     state_bits = file.whole("state_bits", 1, 64, "bits") if "state_bits" in file else None
     name, title, vendor, source = (file.text(key, "; every constant needs its origin") for key in _TEXTS)
     file.short_name("name")
@@ -50,7 +53,7 @@ def read_chip(raw: Any, where: str) -> Chip:
         neurons=_neurons(file),
         widths=Widths(file.whole("weight_bits", 2, 32, "bits"), state_bits),
         mapping=mapping,
-        resources=tuple(_resource(limits, str(resource), mapping, state_bits) for resource in limits.raw),
+        resources=tuple(_resource(limits, resource, mapping, state_bits) for resource in limits.raw),
         notes=file.texts("notes", empty=True) if "notes" in file else (),
     )
 
