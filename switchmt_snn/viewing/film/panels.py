@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from switchmt_snn.viewing.film.canvas import (
     VALUE,
     Box,
     Canvas,
+    font,
     number,
 )
 from switchmt_snn.viewing.film.layout import GAINS_LINE, GAINS_LINE_COMPACT, GAINS_TITLE, RATES_LINE, RATES_TITLE
@@ -168,7 +170,8 @@ def draw_values(canvas: Canvas, box: Box, names: Names, seen: Seen, compact: boo
     below = 40 if compact else 66
     high = min(34, (rest.height - below) // len(exists))
     size = NORMAL if high >= 20 else SMALL if high >= 14 else 11
-    name_wide = 62 if compact else 92
+    longest = max(font(size).getlength(names.actions[action]) for action in exists.tolist())
+    name_wide = min(math.ceil(longest), rest.width // 2 - 40)
     left, right = rest.left + name_wide + 8, rest.right - 56
     low, top = _span(seen.past)
     insight = moment.insight
@@ -195,11 +198,17 @@ def draw_values(canvas: Canvas, box: Box, names: Names, seen: Seen, compact: boo
     if insight.value is not None:
         x = across(insight.value)
         canvas.line([(x, rest.top), (x, bottom)], VALUE, 2)
-    _draw_below_values(canvas, Box(left, bottom, right - left, below), names, moment, (low, top), compact)
+    _draw_below_values(canvas, Box(left, bottom, right - left, below), rest.left, names, moment, (low, top), compact)
 
 
 def _draw_below_values(
-    canvas: Canvas, box: Box, names: Names, moment: Moment, span: tuple[float, float], compact: bool
+    canvas: Canvas,
+    box: Box,
+    names_left: int,
+    names: Names,
+    moment: Moment,
+    span: tuple[float, float],
+    compact: bool,
 ) -> None:
     """The axis' ends, and value and advantage as numbers."""
     value, advantage_A, wide = moment.insight.value, moment.insight.advantage_A, span[1] - span[0]
@@ -209,7 +218,7 @@ def _draw_below_values(
         canvas.text((box.left + box.width / 2, box.top + 20), f"value {number(value, wide)}", SMALL, VALUE, "ma")
     if value is None or advantage_A is None or compact:
         return
-    left, right = box.left - 100, box.right + 56
+    left, right = names_left, box.right + 56
     canvas.text((left, box.top + 28), "value (line)", SMALL, VALUE)
     canvas.text((right, box.top + 28), number(value, wide), SMALL, VALUE, "ra")
     advantage = float(advantage_A[moment.action])
