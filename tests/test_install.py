@@ -39,13 +39,13 @@ print("whole")
 """What an install must hold, wherever Python is started."""
 
 
-def python(*words: str | Path, cwd: Path, path: Path | None = None) -> str:
+def python(*words: str | Path, cwd: Path, path: Path | None = None, interpreter: Path | str = sys.executable) -> str:
     """Standard output of a program that ends well; without ``-O``, which would leave its assertions out."""
     left_out = ("PYTHONPATH", "PYTHONOPTIMIZE")
     environment = {name: value for name, value in os.environ.items() if name not in left_out}
     if path is not None:
         environment["PYTHONPATH"] = str(path)
-    done = subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
+    done = subprocess.run([interpreter, *words], cwd=cwd, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -118,6 +118,4 @@ def test_installs_work_inside_and_outside_of_the_clone(clone: Path, tmp_path: Pa
     interpreter = tmp_path / "venv" / "bin" / "python"
     found = str(clone) if editable else str(site)
     for folder, expected in ((tmp_path, found), (clone, str(clone))):
-        done = subprocess.run([interpreter, "-c", CHECK, expected], cwd=folder, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout == "whole\n"
+        assert python("-c", CHECK, expected, cwd=folder, interpreter=interpreter) == "whole\n"
