@@ -12,7 +12,8 @@ import pytest
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config
 from switchmt_snn.config.numbers import exact, whole_number
-from switchmt_snn.drawing.numbers import duration
+from switchmt_snn.drawing.chart import ticks
+from switchmt_snn.drawing.numbers import bytes_of, compact, duration
 from switchmt_snn.errors import shown
 from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
 from switchmt_snn.export.chips.fit import check_fit
@@ -22,12 +23,20 @@ from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.runs.run import load_agent, train
 from switchmt_snn.tasks.gym_make import make_environment
 from switchmt_snn.tasks.report import check_env
+from switchmt_snn.viewing.report.curves import running_means, thinned
+from switchmt_snn.viewing.report.page import write_report
 
 EXAMPLES: tuple[Any, ...] = (
     load_config,
     exact,
     whole_number,
+    ticks,
+    compact,
+    bytes_of,
     duration,
+    running_means,
+    thinned,
+    write_report,
     file_name,
     json_text,
     make_environment,

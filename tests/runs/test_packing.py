@@ -99,7 +99,8 @@ def test_a_pretrained_run_is_read_where_it_is_and_copied_to_be_written(own: Path
     evaluate("pretrained/small", episodes=2, seed=5)
     copied = Path("runs/pretrained/small")
     assert bytes_of(own) == before
-    assert set(bytes_of(copied)) - set(before) == {
+    written = {name for name in bytes_of(copied) if not name.startswith("random_play/")} - set(before)
+    assert written == {
         f"evaluations/step-000000000400_Acrobot-v1+CartPole-v1_n2_seed5_epsilon0.05_envs2.{kind}"
         for kind in ("csv", "json")
     }
