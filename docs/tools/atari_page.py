@@ -31,6 +31,12 @@ to three steps, batches of 64 and 4 samples) were changed at once: which of them
 ANN twin. The run was stopped for lack of machine time, not because it had stopped learning. It was recorded under the
 trunk's name `nature` with the channels of `nature_half` written into the table of trunks; the preset gave bitwise the
 same weights after 2,400 steps.
+
+**Which network is evaluated matters.** The scores below are of the network that learns. The one after 139,528 steps was
+saved between two estimates of its BatchNorm statistics, and plays far below the training returns. The target network of
+the same checkpoint, which acts in training and has statistics of its own weights, scores **15.3 ± 0.7** (30 episodes,
+the same protocol; a human: 14.6): `pretrained/pong`. At 100,000 steps statistics were fresh. That evaluations and
+exports take the network that acts is the next change.
 """,
 }
 """What a reader must know of a run."""

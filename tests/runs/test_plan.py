@@ -43,9 +43,10 @@ def test_a_planned_config_holds_no_auto_but_the_device() -> None:
     assert (again.config, again.notes) == (made.config, ())
 
 
-def test_a_run_that_cannot_fit_is_refused_by_its_plan() -> None:
+def test_a_run_that_cannot_fit_is_refused_by_its_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("switchmt_snn.runs.memory.available_bytes", lambda: 8 * 2**30)
     with pytest.raises(ConfigError, match=r"lower learning\.replay_capacity_steps to at most"):
-        plan(cartpole(replay_capacity_steps=10**12))
+        plan(cartpole(replay_capacity_steps=10**9))
 
 
 @pytest.mark.parametrize(
