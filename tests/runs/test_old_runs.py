@@ -33,6 +33,11 @@ def columns(path: Path, names: tuple[str, ...]) -> list[tuple[str, ...]]:
         return [tuple(row[name] for name in names) for row in csv.DictReader(stream)]
 
 
+FREE = ("trunk.conv1.synapses.bias", "trunk.conv1.normalization.running_mean_KC")
+"""BatchNorm takes a bias before it away again: its gradient is 0 but for rounding, of which Adam makes steps (they were
+up to 8.5e-5 on a processor without AVX-512), and the running mean follows."""
+
+
 def test_an_old_run_continues_as_the_old_version_continued_it(old_run: Path) -> None:
     """Same episodes, and the same weights to rounding (another processor may sum in another order)."""
     steps = CONTINUED_TO[old_run.name]
@@ -44,7 +49,8 @@ def test_an_old_run_continues_as_the_old_version_continued_it(old_run: Path) -> 
     expected = load_file(FIXTURES / f"{old_run.name}.continued.safetensors")
     assert weights.keys() == expected.keys()
     for name, tensor in expected.items():
-        torch.testing.assert_close(weights[name], tensor, rtol=1e-4, atol=1e-5, msg=name)
+        atol = 2e-4 if name in FREE else 1e-5
+        torch.testing.assert_close(weights[name], tensor, rtol=1e-4, atol=atol, msg=name)
     names = ("step", "task", "episode", "length_steps", "truncated", "updates")
     expected_rows = columns(FIXTURES / f"{old_run.name}.continued.episodes.csv", names)
     assert columns(old_run / "episodes.csv", names) == expected_rows
