@@ -291,7 +291,7 @@ def _references(frame: _Frame, references: Sequence[Reference]) -> list[Mark]:
         marks.append(Line(((frame.left, y), (right, y)), "soft", 1.2, True))
         baseline = max(y - 4, frame.top + 10, taken + 12)
         if baseline < frame.bottom - 2:
-            marks.append(Label(right - 2, baseline, f"{one.name} {digits(one.y)}", 11.0, "end", "ink"))
+            marks.append(Label(right - 2, baseline, f"{one.name} {digits(one.y)}", 11.0, "end", "ink", True))
             taken = baseline
     return marks
 

@@ -89,7 +89,7 @@ class Dot:
 
 @dataclass(frozen=True)
 class Label:
-    """A line of text; ``y`` is its baseline."""
+    """A line of text; ``y`` is its baseline. With a halo it stays readable over lines."""
 
     x: float
     y: float
@@ -97,6 +97,7 @@ class Label:
     size: float = 12.0
     anchor: Literal["start", "middle", "end"] = "start"
     colour: str = "soft"
+    halo: bool = False
     series: int | None = None
 
 

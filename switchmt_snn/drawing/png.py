@@ -46,7 +46,9 @@ def _draw(canvas: ImageDraw.ImageDraw, mark: Mark, scale: float) -> None:
         canvas.ellipse([low, high], fill=_paint(mark.colour, mark.opacity))
     elif isinstance(mark, Label):
         font = ImageFont.load_default(mark.size * scale)
-        canvas.text(at(((mark.x, mark.y),))[0], mark.text, _paint(mark.colour), font, _ANCHORS[mark.anchor])
+        place, halo = at(((mark.x, mark.y),))[0], round(1.5 * scale) if mark.halo else 0
+        anchor, paper = _ANCHORS[mark.anchor], _paint("paper")
+        canvas.text(place, mark.text, _paint(mark.colour), font, anchor, stroke_width=halo, stroke_fill=paper)
     else:
         _box(canvas, mark, scale)
 

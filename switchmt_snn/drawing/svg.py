@@ -49,9 +49,10 @@ def _mark(mark: Mark, colour: Callable[[str], str]) -> str:
         opacity = f' fill-opacity="{_n(mark.opacity)}"' if mark.opacity < 1 else ""
         return f'<circle cx="{_n(mark.x)}" cy="{_n(mark.y)}" r="{_n(mark.radius)}" fill="{paint}"{opacity}/>'
     if isinstance(mark, Label):
+        halo = f' stroke="{colour("paper")}" stroke-width="3" paint-order="stroke"' if mark.halo else ""
         return (
             f'<text x="{_n(mark.x)}" y="{_n(mark.y)}" font-size="{_n(mark.size)}" text-anchor="{mark.anchor}" '
-            f'fill="{paint}">{escape(mark.text)}</text>'
+            f'fill="{paint}"{halo}>{escape(mark.text)}</text>'
         )
     place = f'x="{_n(mark.x)}" y="{_n(mark.y)}" width="{_n(mark.width)}" height="{_n(mark.height)}"'
     opacity = f' fill-opacity="{_n(mark.opacity)}"' if mark.opacity < 1 else ""

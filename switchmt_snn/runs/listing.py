@@ -98,9 +98,19 @@ def summarize(path: Path) -> RunSummary:
         SwitchMTError: it is no run, or a file of it cannot be read.
     """
     folder = RunFolder(path).require()
-    config, created = folder.config(), _created(path)
-    history = read_history(path, config.tasks.names)
-    evaluations = folder.evaluations.all()
+    config, created = folder.config(), when_begun(path)
+    return summary_of(folder, config, created, read_history(path, config.tasks.names), folder.evaluations.all())
+
+
+def summary_of(
+    folder: RunFolder,
+    config: ExperimentConfig,
+    created: str,
+    history: History,
+    evaluations: Sequence[dict[str, Any]],
+) -> RunSummary:
+    """``summarize`` of what was read already."""
+    path = folder.path
     steps = steps_so_far(folder, history, evaluations)
     return RunSummary(
         path=path,
@@ -118,7 +128,7 @@ def summarize(path: Path) -> RunSummary:
     )
 
 
-def _created(path: Path) -> str:
+def when_begun(path: Path) -> str:
     """When a run began.
 
     Raises:

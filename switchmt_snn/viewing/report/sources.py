@@ -14,7 +14,7 @@ from switchmt_snn.learning.events import EpisodeEnded
 from switchmt_snn.learning.switching.criterion import Deciding, criterion_class
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.history import History, policy_columns, read_history
-from switchmt_snn.runs.listing import RunSummary, summarize
+from switchmt_snn.runs.listing import RunSummary, summary_of, when_begun
 from switchmt_snn.tasks.registry import find_suite
 from switchmt_snn.tasks.suite import Suite
 
@@ -76,11 +76,12 @@ def read_sources(path: Path) -> Sources:
     """
     folder = RunFolder(path).require()
     config = folder.config()
+    history, evaluations = read_history(path, config.tasks.names), tuple(folder.evaluations.all())
     return Sources(
         folder=folder,
         config=config,
         environment=json.loads((path / "environment.json").read_bytes()),
-        summary=summarize(path),
-        history=read_history(path, config.tasks.names),
-        evaluations=tuple(folder.evaluations.all()),
+        summary=summary_of(folder, config, when_begun(path), history, evaluations),
+        history=history,
+        evaluations=evaluations,
     )
