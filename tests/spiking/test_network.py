@@ -180,12 +180,12 @@ def test_building_leaves_the_global_generator_alone() -> None:
     ("key", "value", "expected"),
     [
         ("readout", "median", "mean or last_membrane or max_membrane"),
-        ("trunk", "resnet", "nature or minatar or mlp; .*resolve replaces auto"),
-        ("trunk", "auto", "nature or minatar or mlp; .*resolve replaces auto"),
+        ("trunk", "resnet", "nature or nature_half or minatar or mlp; .*resolve replaces auto"),
+        ("trunk", "auto", "nature or nature_half or minatar or mlp; .*resolve replaces auto"),
         ("dendrites", "auto", "none or shared or per_neuron; .*resolve replaces auto"),
         ("dendritic_gating", "min", "max or absolute_max"),
         ("normalization", "none", "per_task or shared"),
-        ("neuron", "Izhikevich", "IF or LIF or Synaptic or ALIF"),
+        ("neuron", "Izhikevich", "one of IF, LIF, Synaptic, ALIF, or package.module:Class"),
     ],
 )
 def test_unknown_values_are_refused_by_name(key: str, value: str, expected: str) -> None:

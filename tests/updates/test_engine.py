@@ -229,7 +229,7 @@ def test_bfloat16_equals_eager_bfloat16(
     assert ours.keys() >= {"online", "target", "choice_BA"}
     for name in ours:
         close = torch.isclose(ours[name].float(), theirs[name].float(), rtol=0.05, atol=0.02)
-        assert close.float().mean() > 0.97 or not close.numel() or is_chaotic, name
+        assert close.float().mean() > 0.96 or not close.numel() or is_chaotic, name  # 31 of 32 biases, or more
         our_error, their_error = ((x[name].float() - exact[name]).abs().sum() for x in (ours, theirs))
         assert our_error <= 1.3 * their_error + 0.01 * close.numel(), name
 
