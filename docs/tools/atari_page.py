@@ -32,11 +32,12 @@ ANN twin. The run was stopped for lack of machine time, not because it had stopp
 trunk's name `nature` with the channels of `nature_half` written into the table of trunks; the preset gave bitwise the
 same weights after 2,400 steps.
 
-**Which network is evaluated matters.** The scores below are of the network that learns. The one after 139,528 steps was
-saved between two estimates of its BatchNorm statistics, and plays far below the training returns. The target network of
-the same checkpoint, which acts in training and has statistics of its own weights, scores **15.3 ± 0.7** (30 episodes,
-the same protocol; a human: 14.6): `pretrained/pong`. At 100,000 steps statistics were fresh. That evaluations and
-exports take the network that acts is the next change.
+**Which network is evaluated matters.** The scores below are of the network that learns, which evaluations took then.
+The one after 139,528 steps was saved between two estimates of its BatchNorm statistics, and plays far below the
+training returns. The target network of the same checkpoint, which acts in training and has statistics of its own
+weights, scores **15.3 ± 0.7** (30 episodes, the same protocol; a human: 14.6): `pretrained/pong`. Evaluations and
+exports take it now.
+At 100,000 steps statistics were fresh.
 """,
 }
 """What a reader must know of a run."""

@@ -47,7 +47,7 @@ class LearningConfig:
     more; else eager."""
     acting_network: Literal["online", "target"] = "online"
     """By whose Q-values training acts: Q's, or those of Q*, whose weights stay with their BatchNorm statistics from one
-    copy to the next."""
+    copy to the next. This network is stored as the run's model, evaluated, exported and filmed."""
     next_statistics: Literal["running", "batch"] = "running"
     """What BatchNorm normalizes the next states by, in Q* and in the choice of Q: running statistics, which lag behind
     Q's weights, or those of the batch, as in the pass that is trained."""
@@ -88,8 +88,8 @@ class LearningConfig:
     """Count these copies in updates, over all tasks: a number takes the place of target_update_every_steps."""
     reestimate_statistics_batches: int = 0
     """Estimate BatchNorm's running statistics of Q anew from so many batches of each task's replay: before each copy to
-    Q*, when a visit to the task starts, before an evaluation and at the end. Running statistics belong to past weights:
-    targets are biased, and a task that was away looks forgotten. 0: off."""
+    Q*, when a visit to the task starts, and if Q acts before an evaluation and at the end. Running statistics belong to
+    past weights: targets are biased, and a task that was away looks forgotten. 0: off."""
     first_layer_mean: Literal["running", "input"] = "running"
     """Where BatchNorm takes the first layer's running mean from. running: the mean of its currents over past updates.
     input: its present weights times the running mean input, set after every update, so that the network that acts is

@@ -178,9 +178,13 @@ class Learner(Stateful):
             )
         return self.engine.decisions
 
+    @property
+    def acting_network(self) -> QNetwork:
+        """By whose Q-values training acts (``learning.acting_network``); it is evaluated, exported and kept as best."""
+        return self.target if self.config.acting_network == "target" else self.network
+
     def _eager_decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
-        network = self.target if self.config.acting_network == "target" else self.network
-        return cast(Tensor, network.eval()(observations, task, generator=generator))
+        return cast(Tensor, self.acting_network.eval()(observations, task, generator=generator))
 
     def act(self, observations: npt.NDArray[np.generic], task: int) -> npt.NDArray[np.int64]:
         """Greedy actions ``[B]`` for raw stacked observations ``[B, ...]`` of a task (eval mode)."""

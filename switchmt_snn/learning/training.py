@@ -265,11 +265,17 @@ class Training(Stateful):
         for task in range(len(self.replays)):
             self._reestimate(task, self.learner.network)
 
-    def with_fresh_statistics(self) -> QNetwork:
-        """The network as ``reestimate_statistics`` would make it: a copy, or with the setting off the learner's own."""
-        if self.config.learning.reestimate_statistics_batches == 0:
-            return self.learner.network
-        network = copy.deepcopy(self.learner.network)
+    def settle_acting_network(self) -> None:
+        """Estimate the acting network's statistics anew, before it is evaluated. Those of Q* are: since its copy."""
+        if self.learner.acting_network is self.learner.network:
+            self.reestimate_statistics()
+
+    def settled_acting_network(self) -> QNetwork:
+        """The acting network as ``settle_acting_network`` would make it: a copy, or where it does nothing, its own."""
+        acts = self.learner.acting_network
+        if self.config.learning.reestimate_statistics_batches == 0 or acts is self.learner.target:
+            return acts
+        network = copy.deepcopy(acts)
         for task in range(len(self.replays)):
             self._reestimate(task, network)
         return network

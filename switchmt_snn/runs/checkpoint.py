@@ -4,6 +4,9 @@
     checkpoints/replay/           <sha256>.zst: segments of replay frames, shared by the checkpoints
     checkpoints/best/             model.safetensors  manifest.json
 
+``model.safetensors`` is the network that acts: Q, or with ``learning.acting_network: target`` Q*. The other one is in
+``training.safetensors``.
+
 A checkpoint is written to a temporary folder and renamed, so it exists whole or not at all; the one before it is
 removed only after that. Frames of a full replay segment are written once, however many checkpoints refer to them.
 """
@@ -28,8 +31,10 @@ from switchmt_snn.errors import CheckpointError, require_saved
 from switchmt_snn.replay.ring import FrameReplay, Segment
 from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
 
-FORMAT = 3
-"""Goes up when a saved state gets another shape. 2: paused episodes of every task. Weights are read from any."""
+FORMAT = 4
+"""Goes up when a saved state gets another shape. 2: paused episodes of every task. 4: model.safetensors may be Q*."""
+_CONTINUED = 3
+"""The oldest format that can be continued. Weights are read from any."""
 _STEP_DIGITS = 12
 _MODEL_FILE = "model.safetensors"
 
@@ -100,8 +105,22 @@ class CheckpointStore:
 
     # Writing
 
-    def save(self, step: int, state: dict[str, Any], replays: list[FrameReplay], log_sizes: dict[str, int]) -> Path:
+    def save(
+        self,
+        step: int,
+        state: dict[str, Any],
+        replays: list[FrameReplay],
+        log_sizes: dict[str, int],
+        acting_network: str = "online",
+    ) -> Path:
         """Write a checkpoint, then drop the ones that are too old.
+
+        Args:
+            step: agent steps of the run.
+            state: ``Training.state_dict()``.
+            replays: whose frames are stored.
+            log_sizes: bytes of each log file.
+            acting_network: which network becomes ``model.safetensors``, ``online`` or ``target``.
 
         Raises:
             OSError: the disk is full or not writable; older checkpoints are untouched.
@@ -115,13 +134,14 @@ class CheckpointStore:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
         try:
-            model, training, tree = _split(state)
+            model, training, tree = _split(state, _MODEL_PREFIXES[acting_network])
             files = {
                 _MODEL_FILE: safetensors.torch.save(model),
                 "training.safetensors": safetensors.torch.save(training),
                 "state.json": json.dumps(tree).encode(),
             }
-            self._write_folder(temporary, files, {"step": step, "segments": segments, "logs": log_sizes})
+            facts = {"step": step, "acting_network": acting_network, "segments": segments, "logs": log_sizes}
+            self._write_folder(temporary, files, facts)
             if final.exists():
                 shutil.rmtree(final)
             temporary.rename(final)
@@ -231,8 +251,10 @@ class CheckpointStore:
 
     def _load_one(self, path: Path, replays: list[FrameReplay], damaged: tuple[str, ...]) -> LoadedCheckpoint:
         manifest = _read_manifest(path)
-        if manifest["format"] < FORMAT:
-            raise CheckpointError(f"format {manifest['format']} can be evaluated, but only {FORMAT} can be continued")
+        if manifest["format"] < _CONTINUED:
+            raise CheckpointError(
+                f"format {manifest['format']} can be evaluated, but only {_CONTINUED} and later can be continued"
+            )
         if list(manifest["files"]) == [_MODEL_FILE]:
             raise _WeightsOnly(
                 f"{path} holds weights only (a packed run), expected a run with its replay; it can be evaluated, "
@@ -241,7 +263,7 @@ class CheckpointStore:
         model = _read_tensors(path, _MODEL_FILE, manifest)
         training = _read_tensors(path, "training.safetensors", manifest)
         tree = _read_json(_read_file(path, "state.json", manifest), "state.json")
-        state = _join(tree, model, training)
+        state = _join(tree, model, training, _MODEL_PREFIXES[manifest.get("acting_network", "online")])
         contents = [self._read_segment(entry) for entry in manifest["segments"]]
         require_saved(state, ("replays",), "the run")
         require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
@@ -351,10 +373,10 @@ def _read_tensors(path: Path, name: str, manifest: dict[str, Any]) -> dict[str, 
 
 # A nested state <-> tensors by path and a JSON tree in which {"$tensor": path} stands for a tensor.
 
-_MODEL_PREFIX = "learner/network/"
+_MODEL_PREFIXES = {"online": "learner/network/", "target": "learner/target/"}
 
 
-def _split(state: dict[str, Any]) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], Any]:
+def _split(state: dict[str, Any], prefix: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], Any]:
     tensors: dict[str, torch.Tensor] = {}
 
     def walk(value: Any, path: str) -> Any:
@@ -371,15 +393,15 @@ def _split(state: dict[str, Any]) -> tuple[dict[str, torch.Tensor], dict[str, to
         return value
 
     tree = walk(state, "")
-    model = {k.removeprefix(_MODEL_PREFIX): v for k, v in tensors.items() if k.startswith(_MODEL_PREFIX)}
-    training = {k: v for k, v in tensors.items() if not k.startswith(_MODEL_PREFIX)}
+    model = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    training = {k: v for k, v in tensors.items() if not k.startswith(prefix)}
     return model, training, tree
 
 
-def _join(tree: Any, model: dict[str, torch.Tensor], training: dict[str, torch.Tensor]) -> Any:
+def _join(tree: Any, model: dict[str, torch.Tensor], training: dict[str, torch.Tensor], prefix: str) -> Any:
     def find(path: str) -> torch.Tensor:
-        source = model if path.startswith(_MODEL_PREFIX) else training
-        key = path.removeprefix(_MODEL_PREFIX)
+        source = model if path.startswith(prefix) else training
+        key = path.removeprefix(prefix)
         if key not in source:
             raise CheckpointError(f"tensor {path} is missing")
         return source[key]

@@ -238,7 +238,7 @@ class _Driver:
                             stopped = training.steps < self.config.total_steps
                             break
                 if not stopped:
-                    training.reestimate_statistics()
+                    training.settle_acting_network()
                 self._save()
         finally:
             for observer in self.observers:
@@ -268,7 +268,7 @@ class _Driver:
     def _record(self, step: int, requested: Callable[[], bool]) -> None:
         """Save and evaluate when a border of their periods was crossed by the last vector step."""
         if self._evaluates_at(step):
-            self.training.reestimate_statistics()
+            self.training.settle_acting_network()
             self._evaluate_in_training(requested)
         before = step - self.training.num_envs
         every = self.config.recording.checkpoint_every_steps
@@ -296,8 +296,9 @@ class _Driver:
         assert self.logs is not None
         training = self.training
         training.check_finite()
-        self.store.save(training.steps, training.state_dict(), training.replays, self.logs.sync())
-        self.best.at_checkpoint(training.steps, training.with_fresh_statistics)
+        acting = self.config.learning.acting_network
+        self.store.save(training.steps, training.state_dict(), training.replays, self.logs.sync(), acting)
+        self.best.at_checkpoint(training.steps, training.settled_acting_network)
 
     def _is_solved(self, means: dict[str, float]) -> bool:
         """Whether an evaluation's mean returns by task reach ``evaluation.stop_at_returns``."""
@@ -314,7 +315,8 @@ class _Driver:
 
     def _evaluate(self, settings: EvaluationConfig, stop: Callable[[], bool] | None = None) -> Evaluation:
         training = self.training
-        agent = Agent(training.learner.network, training.suite, self.config, training.learner.device, training.steps)
+        learner = training.learner
+        agent = Agent(learner.acting_network, training.suite, self.config, learner.device, training.steps)
         protocol = EvaluationProtocol.of(settings, self.config.tasks)
         self._note(f"evaluating: {protocol}")
         known = RandomPlay(self.folder.path, self.config, training.suite, protocol)

@@ -113,7 +113,7 @@ def test_a_visit_starts_with_fresh_statistics_of_its_task(task: int) -> None:
 
 def test_the_target_network_is_copied_with_fresh_statistics_of_all_tasks() -> None:
     part = updated()
-    fresh = part.with_fresh_statistics().state_dict()
+    fresh = part.settled_acting_network().state_dict()
     assert changed_tasks(part.learner.target, fresh) == {0, 1}
     part._copy_target(passed=part.target_clock.period_steps)
     for name, tensor in part.learner.target.state_dict().items():
@@ -123,7 +123,7 @@ def test_the_target_network_is_copied_with_fresh_statistics_of_all_tasks() -> No
 def test_estimating_twice_at_a_step_gives_the_same_statistics_and_draws_nothing_of_training() -> None:
     part = updated(encoding="rate")
     draws = copy.deepcopy((part.sample_rng.bit_generator.state, part.learner.generator.get_state()))
-    fresh = part.with_fresh_statistics().state_dict()
+    fresh = part.settled_acting_network().state_dict()
     assert any(not torch.equal(fresh[name], x) for name, x in part.learner.network.state_dict().items())
     for _ in range(2):
         part.reestimate_statistics()
