@@ -128,9 +128,16 @@ def num_actions(name: str, space: gymnasium.Space[Any]) -> int:
 
 
 def _remedy(space: gymnasium.Space[Any]) -> str:
-    if space.is_np_flattenable:
+    try:
+        flattens = space.is_np_flattenable
+    except NotImplementedError:  # of a space that the environment's package made
+        flattens = False
+    if flattens:
         return FLATTEN
-    return "choose its numbers in a wrapper of your own (gymnasium.ObservationWrapper; tasks.wrappers=[module:Name])"
+    return (
+        "choose its numbers in a wrapper (tasks.wrappers=[module:Name]): one of the environment's package, such as "
+        "minigrid.wrappers:ImgObsWrapper, or a gymnasium.ObservationWrapper of your own"
+    )
 
 
 def _short(space: gymnasium.Space[Any]) -> str:

@@ -113,7 +113,9 @@ def check_env(
         warnings.simplefilter("always")
         tasks = make_suite(config)
         reports = [_report(config, tasks, task, steps, seed) for task in range(len(names))]
-    heard = tuple(dict.fromkeys(_plain(str(warning.message)) for warning in caught))
+    # A DeprecationWarning is for a library's authors; Python, too, hides it from those who run the library.
+    told = (warning for warning in caught if not issubclass(warning.category, DeprecationWarning))
+    heard = tuple(dict.fromkeys(_plain(str(warning.message)) for warning in told))
     if heard and len(reports) == 1:
         reports[0] = replace(reports[0], notes=(*reports[0].notes, *heard))
     return tuple(reports)

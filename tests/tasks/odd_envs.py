@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import warnings
 from typing import Any
 
 import gymnasium
@@ -187,6 +188,31 @@ class Composed(Plain):
 
     def observe(self) -> Any:
         return {"image": np.full((3, 3), 7, np.uint8), "state": 2, "pair": (1, 0)}
+
+
+class OwnSpace(gymnasium.Space[str]):
+    """A space of a package's own, as MiniGrid has one for a mission's text."""
+
+    def sample(self, mask=None, probability=None):  # type: ignore[no-untyped-def]
+        return "go"
+
+    def contains(self, x: Any) -> bool:
+        return isinstance(x, str)
+
+
+class Mission(Plain):
+    observation_space = Dict({"numbers": Box(-10.0, 10.0, (4,), np.float32), "mission": OwnSpace()})
+
+    def observe(self) -> Any:
+        return {"numbers": super().observe(), "mission": "go"}
+
+
+class Outdated(Plain):
+    """Tells its author something at every step."""
+
+    def observe(self) -> Any:
+        warnings.warn("builtin type without __module__", DeprecationWarning, stacklevel=2)
+        return super().observe()
 
 
 class Combined(Plain):

@@ -155,6 +155,7 @@ def test_truth_values_are_frames_of_zeros_and_ones() -> None:
             r"expected uint8 or bool: 2 dimensions are taken for an image; if they are none, set task",
         ),
         (("Composed",), r"expected a Box; set tasks\.wrappers=\[FlattenObservation\]"),
+        (("Mission",), r"expected a Box; choose its numbers in a wrapper \(tasks\.wrappers=\[module:Name\]\)"),
         (("Combined",), r"expected Discrete: .* set tasks\.wrappers=\[FlattenAction\]"),
         (("Planes", "ChannelsLast"), "mix images of uint8 and of bool"),
         (("Plain", "ChannelsLast"), "mix images and vectors"),

@@ -84,6 +84,7 @@ def test_drawing_from_global_generators_is_seen_and_does_not_keep_play_from_repe
 def test_warnings_of_gymnasiums_checker_are_notes() -> None:
     notes = report_of("DoubleObservation").notes
     assert any("was expecting a numpy array" in note and "\x1b" not in note for note in notes)
+    assert not any("__module__" in note for note in report_of("Outdated").notes), "meant for the library's author"
 
 
 def test_what_training_would_refuse_is_refused() -> None:
