@@ -16,11 +16,11 @@ import numpy.typing as npt
 import torch
 import zstandard
 
+from switchmt_snn.replay.slabs import Place, Slabs
+
 ZSTD_LEVEL = 3
 _FEW_BLOCKS = 8
 """Read by one thread: another would take longer to wake."""
-_BYTES_OBJECT = 33 + 8
-"""What a block takes beside its content: the head of a bytes object, and the allocator's."""
 
 Slots = npt.NDArray[np.int64]
 Frames = npt.NDArray[Any]
@@ -83,8 +83,9 @@ class CompressedFrames:
         self._block_slots = block_slots
         self._frame_bytes = int(np.prod(frame_shape)) * self._dtype.itemsize
         self._blocks_per_lane = -(-slots // self._block_slots)
-        self._blocks: list[bytes | None] = [None] * (num_lanes * self._blocks_per_lane)
-        self._compressed_bytes = 0
+        self._contents = Slabs()
+        # Of each block: its ``Place`` (slab -1: not held).
+        self._places = np.full((num_lanes * self._blocks_per_lane, 3), -1, np.int64)
         # Of each lane: the block that is being filled (-1: none) and its frames.
         self._open = np.full(num_lanes, -1, np.int64)
         self._open_frames = np.zeros((num_lanes, self._block_slots, self._frame_bytes), np.uint8)
@@ -93,8 +94,8 @@ class CompressedFrames:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the compressed blocks, of Python's objects around them, and of the open blocks."""
-        return self._compressed_bytes + 8 * len(self._blocks) + self._open_frames.nbytes
+        """Bytes of the compressed blocks, of their places, and of the open blocks."""
+        return self._contents.content_bytes + self._places.nbytes + self._open_frames.nbytes
 
     def write(self, lane: int, within: int, frame: Frames) -> None:
         """Store a lane's next frame; compresses its block if that is full."""
@@ -160,23 +161,24 @@ class CompressedFrames:
         return lane * self._blocks_per_lane + within // self._block_slots
 
     def _store(self, block: int, content: bytes | None) -> None:
-        for stored, sign in ((self._blocks[block], -1), (content, 1)):
-            if stored is not None:
-                self._compressed_bytes += sign * (len(stored) + _BYTES_OBJECT)
-        self._blocks[block] = content
+        stored = Place(*self._places[block].tolist())
+        if stored.slab >= 0:
+            self._contents.remove(stored)
+        self._places[block] = (-1, -1, -1) if content is None else self._contents.add(content)
 
     def _read_block(self, block: int, first: int, out: npt.NDArray[np.uint8]) -> None:
         """Frames of a block as bytes, from one of them on; zeros if the block is not held."""
-        lane, content = block // self._blocks_per_lane, self._blocks[block]
+        lane, place = block // self._blocks_per_lane, Place(*self._places[block].tolist())
         if self._open[lane] == block:
             out[:] = self._open_frames[lane, first : first + len(out)]
             return
-        if content is None:
+        if place.slab < 0:
             out[:] = 0
             return
         if not hasattr(self._of_thread, "decompressor"):
             self._of_thread.decompressor = zstandard.ZstdDecompressor()
-        changes = np.frombuffer(self._of_thread.decompressor.decompress(content), np.uint8)
+        content = self._of_thread.decompressor.decompress(self._contents.view(place))
+        changes = np.frombuffer(content, np.uint8)
         changes = changes.reshape(-1, self._frame_bytes)
         np.bitwise_xor.reduce(changes[: first + 1], axis=0, out=out[0])
         for index in range(1, len(out)):
