@@ -29,6 +29,9 @@ class TasksConfig:
     image_layout: Literal["by_shape", "channels_last", "channels_first"] = "by_shape"
     """gym suite: which axis of images with three axes holds the channels. by_shape: the shape tells; one that does not
     say is refused."""
+    subprocesses: bool = False
+    """gym suite: step every copy in a process of its own, all at the same time (Gymnasium's AsyncVectorEnv). For
+    environments that take longer than a millisecond for a step; play is the same."""
     num_envs: int = 1
     """Copies of the current task that are stepped together; one vector step counts as this many agent steps."""
     frame_stack: int | None = None

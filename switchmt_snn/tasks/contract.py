@@ -12,6 +12,7 @@ from switchmt_snn.errors import TaskError, shown
 from switchmt_snn.tasks.suite import Frames, Picture, TaskSuite, VectorStep
 
 METHODS = {
+    "make": "make(task, num_envs) -> the copies of a task",
     "reset": "reset(env_ids, seeds) -> frames; of a Gymnasium environment, reset(seed=...) -> (observation, info)",
     "step": "step(actions) -> VectorStep; of a Gymnasium environment, step(action) -> (observation, reward, "
     "terminated, truncated, info)",
@@ -22,6 +23,16 @@ METHODS = {
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
 """Replay memories hold rewards as float32."""
+
+
+def task_code(name: str, where: str) -> AbstractContextManager[None]:
+    """Around a call of an environment's own code: what it raises becomes one line.
+
+    Args:
+        name: of the task.
+        where: the method, one of ``METHODS``.
+    """
+    return user_code(f"task {name!r} fails in {where}", METHODS[where], TaskError)
 
 
 class CheckedEnvironment:
@@ -40,7 +51,7 @@ class CheckedEnvironment:
         self.num_envs = num_envs
         self._tasks, self._name = tasks, tasks.names[task]
         self._dtype = np.dtype(tasks.frame_dtype)
-        with self._code("make", "make(task, num_envs) -> the copies of a task"):
+        with task_code(self._name, "make"):
             self._environment = tasks.make(task, num_envs)
         seen = f"task {self._name!r} is played by {type(self._environment).__name__}, which has"
         for method in ("reset", "step", "close"):
@@ -56,7 +67,7 @@ class CheckedEnvironment:
         Raises:
             TaskError: the environment fails, or its frames are not what the suite says.
         """
-        with self._code("reset", METHODS["reset"]):
+        with task_code(self._name, "reset"):
             frames = self._environment.reset(env_ids, seeds)
         self._require_frames(frames, len(env_ids))
         return frames
@@ -67,7 +78,7 @@ class CheckedEnvironment:
         Raises:
             TaskError: the environment fails, or what it returns is not what the suite says.
         """
-        with self._code("step", METHODS["step"]):
+        with task_code(self._name, "step"):
             result = self._environment.step(actions)
         if not isinstance(result, VectorStep):
             raise TaskError(f"task {self._name!r} gave a {type(result).__name__} from step, expected a VectorStep")
@@ -97,7 +108,7 @@ class CheckedEnvironment:
         draw = getattr(self._environment, "picture", None)
         if draw is None:
             return None
-        with self._code("picture", METHODS["picture"]):
+        with task_code(self._name, "picture"):
             picture = draw(env_id)
         if picture is None:
             return None
@@ -111,9 +122,6 @@ class CheckedEnvironment:
     def close(self) -> None:
         """Free the copies."""
         self._environment.close()
-
-    def _code(self, where: str, expected: str) -> AbstractContextManager[None]:
-        return user_code(f"task {self._name!r} fails in {where}", expected, TaskError)
 
     def _require_frames(self, frames: Frames, count: int) -> None:
         if not isinstance(frames, np.ndarray):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 
 from switchmt_snn.config import resolved_frame_stack
 from switchmt_snn.config.plugins import import_plugin_module, is_plugin
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
-from switchmt_snn.tasks.gym_copies import GymCopies, first_action, is_outside
+from switchmt_snn.tasks.gym_copies import GymCopies, GymCopy, first_action, is_outside
 from switchmt_snn.tasks.gym_make import make_environment, parse_id
+from switchmt_snn.tasks.gym_processes import GymProcesses
 from switchmt_snn.tasks.gym_spaces import FrameLayout, frame_layout, num_actions
 from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
 
@@ -65,12 +69,14 @@ class GymSuite(Suite):
         is_image = layouts[0].is_image
         dtype: npt.DTypeLike = np.uint8 if is_image else np.float32
 
-        def copies(task: int, num_envs: int, pictured: bool) -> GymCopies:
-            envs = [make_environment(names[task], wrappers, pictured) for _ in range(num_envs)]
-            return GymCopies(names[task], envs, frame_shape, dtype, layouts[task].frame)
+        def copy_of(task: int, pictured: bool = False) -> Callable[[], GymCopy]:
+            spec = gymnasium.registry.get(parse_id(names[task])[1])
+            return partial(_copy, names[task], spec, wrappers, pictured, frame_shape, dtype, layouts[task])
 
         def make(task: int, num_envs: int) -> TaskEnvironment:
-            return copies(task, num_envs, pictured=False)
+            if self.config.subprocesses:
+                return GymProcesses(names[task], copy_of(task), num_envs)
+            return GymCopies([copy_of(task)() for _ in range(num_envs)])
 
         return TaskSuite(
             names=names,
@@ -86,8 +92,23 @@ class GymSuite(Suite):
             first_actions=first_actions,
             thread_safe=is_gymnasiums,
             versioned=is_gymnasiums,
-            make_pictured=lambda task, num_envs: copies(task, num_envs, pictured=True),
+            make_pictured=lambda task, num_envs: GymCopies([copy_of(task, True)() for _ in range(num_envs)]),
         )
+
+
+def _copy(
+    name: str,
+    spec: EnvSpec | None,
+    wrappers: tuple[str, ...],
+    pictured: bool,
+    frame_shape: tuple[int, ...],
+    frame_dtype: npt.DTypeLike,
+    layout: FrameLayout,
+) -> GymCopy:
+    """A copy of an environment, also in a process that has not registered its id."""
+    if spec is not None:
+        gymnasium.registry.setdefault(spec.id, spec)
+    return GymCopy(name, make_environment(name, wrappers, pictured), frame_shape, frame_dtype, layout.frame)
 
 
 def _require_one_kind(names: tuple[str, ...], layouts: list[FrameLayout]) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -18,79 +18,75 @@ from switchmt_snn.tasks.suite import Frames, Picture, VectorStep
 Env = gymnasium.Env[Any, Any]
 
 
-class GymCopies:
-    """Copies of one Gymnasium environment stepped one after the other, their frames padded with zeros."""
+class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
+    """One copy of an environment: its observations are the suite's frames, its actions count from 0.
+
+    Every observation is compared with the environment's own space. An environment from outside Gymnasium and MinAtar
+    may draw from the global generators and from its spaces; an episode is a function of its seed all the same.
+    """
 
     def __init__(
         self,
         name: str,
-        envs: Sequence[Env],
+        env: Env,
         frame_shape: tuple[int, ...],
         frame_dtype: npt.DTypeLike,
         to_frame: Callable[[npt.NDArray[Any]], npt.NDArray[Any]],
         before_reset: Callable[[Env], None] | None = None,
     ) -> None:
-        """Wrap environments.
+        """Wrap an environment.
 
         Args:
             name: of the task, for errors.
-            envs: the copies.
-            frame_shape: the suite's frame shape; frames are put at its origin.
+            env: the environment.
+            frame_shape: the suite's frame shape; frames are put at its origin, the rest is zero.
             frame_dtype: the suite's frame type.
             to_frame: observation -> channels-first frame.
             before_reset: clears state that the environment's own reset leaves (MinAtar's previous action).
         """
-        self.num_envs = len(envs)
-        self._name, self._envs = name, list(envs)
-        self._shape, self._dtype, self._to_frame, self._before_reset = frame_shape, frame_dtype, to_frame, before_reset
-        self._first_action = first_action(envs[0])
-        # Environments that are not Gymnasium's own may draw from the global generators, and from their spaces.
-        self._generators = [OwnGenerators() if is_outside(env) else None for env in envs]
-        self._drawing = OwnGenerators() if is_outside(envs[0]) else _NOTHING
-        for env, generators in zip(envs, self._generators, strict=True):
-            if generators is not None:
-                _give_own_spaces(env)
+        super().__init__(env)
+        self._name, self._shape, self._dtype = name, frame_shape, np.dtype(frame_dtype)
+        self._to_frame, self._before_reset = to_frame, before_reset
+        self._first_action = first_action(env)
+        outside = is_outside(env)
+        self._generators = OwnGenerators() if outside else None
+        self._drawing = OwnGenerators() if outside else _NOTHING
+        if outside:
+            _give_own_spaces(env)
+        low, high = (0, 255) if self._dtype == np.uint8 else (-np.inf, np.inf)
+        self.observation_space = gymnasium.spaces.Box(low, high, frame_shape, self._dtype.type)
 
-    def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> Frames:
-        """Start new episodes with the given seeds."""
-        frames = np.zeros((len(env_ids), *self._shape), self._dtype)
-        for row, (env_id, seed) in enumerate(zip(env_ids, seeds, strict=True)):
-            env, generators = self._envs[env_id], self._generators[env_id]
-            if generators is not None:
-                generators.seed(int(seed))
-                _seed_spaces(env, int(seed))
-            if self._before_reset is not None:
-                self._before_reset(env)
-            with generators or _NOTHING:
-                observation, _ = env.reset(seed=int(seed))
-            self._place(frames[row], observation, env)
-        return frames
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start a new episode; the environment's info is left out."""
+        assert seed is not None, "an episode is a function of its seed"
+        if self._generators is not None:
+            self._generators.seed(seed)
+            _seed_spaces(self.env, seed)
+        if self._before_reset is not None:
+            self._before_reset(self.env)
+        with self._generators or _NOTHING:
+            observation, _ = self.env.reset(seed=seed)
+        return self._frame(observation), {}
 
-    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
-        """Step every copy."""
-        n = self.num_envs
-        frames = np.zeros((n, *self._shape), self._dtype)
-        rewards, terminated, truncated = np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-        for i, env in enumerate(self._envs):
-            with self._generators[i] or _NOTHING:
-                observation, reward, ended, cut, _ = env.step(int(actions[i]) + self._first_action)
-            rewards[i] = self._one_number("reward", reward)
-            terminated[i], truncated[i] = self._truth("terminated", ended), self._truth("truncated", cut)
-            self._place(frames[i], observation, env)
-        return VectorStep(frames, rewards, terminated, truncated)
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step; the environment's info is left out."""
+        with self._generators or _NOTHING:
+            observation, reward, ended, cut, _ = self.env.step(int(action) + self._first_action)
+        number = self._one_number("reward", reward)
+        terminated, truncated = self._truth("terminated", ended), self._truth("truncated", cut)
+        return self._frame(observation), number, terminated, truncated, {}
 
-    def picture(self, env_id: int) -> Picture | None:
-        """What a copy's ``render`` gives, as bytes; None if it was made without pictures.
+    def picture(self) -> Picture | None:
+        """What the environment's ``render`` gives, as bytes; None if it was made without pictures.
 
         Raises:
             MissingExtraError: drawing needs a package that is not installed.
         """
-        env = self._envs[env_id]
-        if env.render_mode != "rgb_array":
+        if self.env.render_mode != "rgb_array":
             return None
         try:
             with self._drawing:  # what drawing takes from the global generators, the play does not miss
-                picture = env.render()
+                picture = self.env.render()
         except gymnasium.error.DependencyNotInstalled as error:
             raise MissingExtraError(
                 f"pictures of {self._name} need a package that is not installed ({error}); "
@@ -102,17 +98,12 @@ class GymCopies:
 
     @property
     def draws_globally(self) -> bool:
-        """Whether an environment has drawn from the global generators since its last reset, or seeded them."""
-        return any(generators is not None and generators.were_used for generators in self._generators)
+        """Whether the environment has drawn from the global generators since its last reset, or seeded them."""
+        return self._generators is not None and self._generators.were_used
 
-    def close(self) -> None:
-        """Close the copies."""
-        for env in self._envs:
-            env.close()
-
-    def _place(self, target: npt.NDArray[Any], observation: Any, env: Env) -> None:
-        """Compare an observation with its space, and write its frame."""
-        space = env.observation_space
+    def _frame(self, observation: Any) -> npt.NDArray[Any]:
+        """Compare an observation with its space, and make its frame."""
+        space = self.env.observation_space
         seen = np.shape(observation)
         if seen != space.shape:
             raise TaskError(
@@ -126,8 +117,10 @@ class GymCopies:
                 "its observation_space"
             )
         frame = self._to_frame(array)
+        placed = np.zeros(self._shape, self._dtype)
         with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
-            target[tuple(slice(0, side) for side in frame.shape)] = frame
+            placed[tuple(slice(0, side) for side in frame.shape)] = frame
+        return placed
 
     def _one_number(self, name: str, value: Any) -> float:
         if isinstance(value, (float, int)) or (np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"):
@@ -138,6 +131,40 @@ class GymCopies:
         if isinstance(value, (bool, np.bool_)) or (np.ndim(value) == 0 and value in (0, 1)):
             return bool(value)
         raise TaskError(f"task {self._name!r} gave {name} = {shown(value)}, expected True or False")
+
+
+class GymCopies:
+    """Copies of one Gymnasium environment, stepped one after the other."""
+
+    def __init__(self, copies: Sequence[GymCopy]) -> None:
+        self.num_envs = len(copies)
+        self._copies = list(copies)
+
+    def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> Frames:
+        """Start new episodes with the given seeds."""
+        return np.stack(
+            [self._copies[env_id].reset(seed=int(seed))[0] for env_id, seed in zip(env_ids, seeds, strict=True)]
+        )
+
+    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
+        """Step every copy."""
+        steps = [copy.step(action) for copy, action in zip(self._copies, actions.tolist(), strict=True)]
+        frames, rewards, terminated, truncated, _ = zip(*steps, strict=True)
+        return VectorStep(np.stack(frames), np.asarray(rewards), np.asarray(terminated), np.asarray(truncated))
+
+    def picture(self, env_id: int) -> Picture | None:
+        """A copy as people see the game; None if it was made without pictures."""
+        return self._copies[env_id].picture()
+
+    @property
+    def draws_globally(self) -> bool:
+        """Whether an environment has drawn from the global generators since its last reset, or seeded them."""
+        return any(copy.draws_globally for copy in self._copies)
+
+    def close(self) -> None:
+        """Close the copies."""
+        for copy in self._copies:
+            copy.close()
 
 
 _NOTHING: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
@@ -160,7 +187,7 @@ def _give_own_spaces(env: Env) -> None:
     """Copies may share spaces that are attributes of their class, and with them the generator of ``sample``."""
     for name in ("action_space", "observation_space"):
         with contextlib.suppress(AttributeError):  # a property, which makes its own
-            setattr(env.unwrapped, name, copy.deepcopy(getattr(env.unwrapped, name)))
+            setattr(env.unwrapped, name, deepcopy(getattr(env.unwrapped, name)))
 
 
 def _seed_spaces(env: Env, seed: int) -> None:

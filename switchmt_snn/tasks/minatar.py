@@ -10,7 +10,7 @@ import numpy as np
 from switchmt_snn.config import TasksConfig, resolved_frame_stack
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import MissingExtraError
-from switchmt_snn.tasks.gym_copies import Env, GymCopies
+from switchmt_snn.tasks.gym_copies import Env, GymCopies, GymCopy
 from switchmt_snn.tasks.gym_spaces import channels_last
 from switchmt_snn.tasks.suite import Suite, TaskSuite
 
@@ -60,9 +60,14 @@ class MinAtarSuite(Suite):
             valid_actions_KA = np.stack([np.isin(every, game.game.minimal_action_set()) for game in games])
 
         def make(task: int, num_envs: int) -> GymCopies:
-            envs = [_make_env(config.names[task], config) for _ in range(num_envs)]
+            name = config.names[task]
             return GymCopies(
-                config.names[task], envs, frame_shape, np.uint8, channels_last, before_reset=_forget_previous_action
+                [
+                    GymCopy(
+                        name, _make_env(name, config), frame_shape, np.uint8, channels_last, _forget_previous_action
+                    )
+                    for _ in range(num_envs)
+                ]
             )
 
         return TaskSuite(

@@ -86,7 +86,11 @@ def make_suite(config: TasksConfig) -> TaskSuite:
             f"tasks.minimal_action_mask is True, expected false for the suite {config.suite!r}, which states no "
             "minimal actions (masks_actions)"
         )
-    for key, asked in (("wrappers", bool(config.wrappers)), ("image_layout", config.image_layout == "channels_first")):
+    for key, asked in (
+        ("wrappers", bool(config.wrappers)),
+        ("image_layout", config.image_layout == "channels_first"),
+        ("subprocesses", config.subprocesses),
+    ):
         if asked and not suite.takes_wrappers:
             raise ConfigError(
                 f"tasks.{key} is {getattr(config, key)!r}, expected the default for the suite {config.suite!r}, whose "

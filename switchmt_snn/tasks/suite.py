@@ -189,7 +189,8 @@ class Suite:
         frames_per_s: emulator frames per second of real time; None if the tasks have no clock.
         steps_to_learn: training for fewer agent steps teaches nothing, and a short run says so; None says nothing.
         masks_actions: whether ``make`` follows ``tasks.minimal_action_mask``; else that setting is refused.
-        takes_wrappers: whether ``make`` follows ``tasks.wrappers`` and ``tasks.image_layout``; else they are refused.
+        takes_wrappers: whether ``make`` follows ``tasks.wrappers``, ``image_layout`` and ``subprocesses``; else they
+            are refused.
         references: random and human scores by task, for normalised scores.
         published: rows that are printed under an evaluation.
         config: the tasks that a config asks for.

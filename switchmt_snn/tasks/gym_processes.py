@@ -1,0 +1,116 @@
+"""Copies of a Gymnasium environment, each in a process of its own (Gymnasium's ``AsyncVectorEnv``), for slow ones.
+
+The processes are forked from one server that has imported this package, so they share its memory, and they play what
+copies in this process would play: the same ``GymCopy`` runs in them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+
+from switchmt_snn.errors import TaskError
+from switchmt_snn.tasks.contract import task_code
+from switchmt_snn.tasks.gym_copies import GymCopy
+from switchmt_snn.tasks.suite import Frames, VectorStep
+
+
+class GymProcesses:
+    """Copies of one Gymnasium environment, stepped at the same time in processes of their own."""
+
+    def __init__(self, name: str, make: Callable[[], GymCopy], num_envs: int) -> None:
+        """Start the processes.
+
+        Args:
+            name: of the task, for errors.
+            make: makes a copy; it is called in each process, and once here.
+            num_envs: how many.
+
+        Raises:
+            TaskError: a process ends instead of making its copy.
+        """
+        self.num_envs = num_envs
+        self._name = name
+        methods = multiprocessing.get_all_start_methods()
+        context = "forkserver" if "forkserver" in methods else "spawn"
+        if context == "forkserver":
+            multiprocessing.set_forkserver_preload([__name__])
+        with self._answers():
+            self._vector = AsyncVectorEnv(
+                [partial(_here, name, make)] * num_envs, context=context, autoreset_mode=AutoresetMode.DISABLED
+            )
+
+    def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> Frames:
+        """Start new episodes with the given seeds."""
+        chosen = np.zeros(self.num_envs, np.bool_)
+        chosen[env_ids] = True
+        every: list[int | None] = [None] * self.num_envs
+        for env_id, seed in zip(env_ids.tolist(), seeds.tolist(), strict=True):
+            every[env_id] = seed
+        with self._answers():
+            frames, _ = self._vector.reset(seed=every, options={"reset_mask": chosen})
+        found: Frames = frames[env_ids]
+        return found
+
+    def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
+        """Step every copy."""
+        with self._answers():
+            frames, rewards, terminated, truncated, _ = self._vector.step(actions)
+        return VectorStep(frames, rewards, terminated, truncated)
+
+    def close(self) -> None:
+        """Close the copies and end their processes."""
+        if hasattr(self, "_vector"):
+            try:
+                self._vector.close()
+            except OSError:  # a process has ended before
+                for process in self._vector.processes:
+                    process.kill()
+
+    @contextlib.contextmanager
+    def _answers(self) -> Iterator[None]:
+        """Around a question to the processes: one that has ended is an error; Gymnasium's own log is not shown."""
+        level = gymnasium.logger.min_level
+        gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
+        try:
+            yield
+        except (EOFError, ConnectionError) as error:
+            raise TaskError(
+                f"a process of task {self._name!r} has ended, expected one that lives as long as training; what it "
+                "wrote is above; tasks.subprocesses=false plays without processes (a script that calls train needs "
+                'the line if __name__ == "__main__": before it)'
+            ) from error
+        finally:
+            gymnasium.logger.min_level = level
+
+
+class _Reporting(gymnasium.Wrapper[Any, int, Any, int]):
+    """A copy in a process of its own: an exception becomes its one line here, where its place is known."""
+
+    def __init__(self, name: str, copy: GymCopy) -> None:
+        super().__init__(copy)
+        self._name = name
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        with task_code(self._name, "reset"):
+            return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: int) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        with task_code(self._name, "step"):
+            return self.env.step(action)
+
+
+def _here(name: str, make: Callable[[], GymCopy]) -> _Reporting:
+    """In a process of a copy: make it. Ctrl-C is for the main process, which ends the others."""
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return _Reporting(name, make())
