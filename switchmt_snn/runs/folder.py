@@ -26,6 +26,8 @@ from switchmt_snn.runs.files import json_text, write_atomically
 
 RUNS = Path("runs")
 LOCK = {"run.lock"}
+_FOLDERS = ("checkpoints", "evaluations")
+"""What a new run folder is made of first."""
 LOCK_TIMEOUT_S = 0.5
 """A reader that asks whether a run is going on holds its lock for a moment (``RunFolder.in_use``)."""
 
@@ -94,8 +96,19 @@ class RunFolder:
 
     @property
     def _is_free(self) -> bool:
-        """Whether nothing is here; an empty folder and a lock are nothing."""
-        return not self.path.exists() or (self.path.is_dir() and {entry.name for entry in self.path.iterdir()} <= LOCK)
+        """Whether nothing is here; an empty folder, a lock, and what a ``create`` that was killed left are nothing."""
+        return not self.path.exists() or (self.path.is_dir() and not self._strangers())
+
+    def _strangers(self) -> list[str]:
+        """Names of what neither a lock is nor part of a run that was killed while its folder was made.
+
+        ``create`` makes two folders, then config.yaml, and last environment.json; training fills them afterwards.
+        """
+        names = {entry.name for entry in self.path.iterdir()} - LOCK
+        made = [name for name in _FOLDERS if (self.path / name).is_dir() and not any((self.path / name).iterdir())]
+        begun = {*made, "config.yaml"} if len(made) == len(_FOLDERS) else {*made}
+        unfinished = {name for name in names if name.startswith((".config.yaml.", ".environment.json.")) and made}
+        return sorted(names - begun - unfinished)
 
     def require(self) -> RunFolder:
         """This folder, if it is a run.
@@ -164,13 +177,12 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if not self._is_free:
-                stranger = min(entry.name for entry in self.path.iterdir() if entry.name not in LOCK)
                 raise RunFolderError(
-                    f"{self.path} holds {stranger!r} but no run, expected an empty or new folder; "
+                    f"{self.path} holds {self._strangers()[0]!r} but no run, expected an empty or new folder; "
                     "name another one with --run"
                 )
-            (self.path / "checkpoints").mkdir()
-            (self.path / "evaluations").mkdir()
+            for name in _FOLDERS:
+                (self.path / name).mkdir(exist_ok=True)
             write_atomically(self.path / "config.yaml", to_yaml(config, asked).encode())
             # Last: a folder is a run once this file says so.
             write_atomically(self.path / "environment.json", json_text(environment, indent=1).encode())

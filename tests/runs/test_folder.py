@@ -12,6 +12,7 @@ import pytest
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.folder import RunFolder, claim_new_run, latest_run
 from switchmt_snn.runs.run import train
+from tests.conftest import small_config
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +46,29 @@ def test_a_folder_without_a_run_is_refused_with_the_nearest_one_and_the_command_
             use()
         assert str(refused.value).endswith(command)
     assert [path.name for path in Path("runs/cartpol").iterdir()] == ["run.lock"]
+
+
+def test_a_run_that_was_killed_while_its_folder_was_made_is_begun_anew() -> None:
+    """Killed before environment.json is written: at any of these moments nothing has been trained."""
+    moments = [["checkpoints/"], ["checkpoints/", "evaluations/"], ["checkpoints/", "evaluations/", "config.yaml"]]
+    moments += [["run.lock", *moments[1], ".config.yaml.12-ab.tmp"], [*moments[2], ".environment.json.12-ab.tmp"]]
+    config = small_config(total_steps=60, tasks={"names": ["CartPole-v1"]}, evaluation={"episodes": 1})
+    for number, names in enumerate(moments):
+        folder = Path(f"run{number}")
+        folder.mkdir()
+        for name in names:
+            (folder / name).mkdir() if name.endswith("/") else (folder / name).touch()
+        with pytest.raises(RunFolderError, match="no run folder"):
+            RunFolder(folder).require()
+        if number in (0, len(moments) - 1):
+            assert train(config, folder).status == "finished"
+    for names in (["config.yaml"], ["checkpoints/", "config.yaml"], ["evaluations/", "checkpoints/", "notes.txt"]):
+        folder = Path("strange-" + str(len(names)))
+        folder.mkdir()
+        for name in names:
+            (folder / name).mkdir() if name.endswith("/") else (folder / name).touch()
+        with pytest.raises(RunFolderError, match="but no run, expected an empty or new folder"):
+            train(config, folder)
 
 
 def test_a_folder_that_became_a_run_in_the_meantime_is_refused() -> None:
