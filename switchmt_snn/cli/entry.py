@@ -6,7 +6,20 @@ import sys
 from collections.abc import Callable
 
 from switchmt_snn import __version__
-from switchmt_snn.cli import check_env, describe, doctor, evaluate, export, pack, play, profile, report, runs, train
+from switchmt_snn.cli import (
+    check_env,
+    describe,
+    doctor,
+    evaluate,
+    export,
+    pack,
+    play,
+    profile,
+    report,
+    runs,
+    study,
+    train,
+)
 from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
 from switchmt_snn.machine.program import runnable
 from switchmt_snn.viewing.output import speak_any_encoding
@@ -20,6 +33,7 @@ usage: switchmt-snn COMMAND [options]
   export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
   report [RUN ...]    one HTML page: curves, switches, speed, layers, scores; of several runs a comparison
+  study CONFIG        many runs: variants, grids and seeds from one YAML file, each a plain run; resumable
   runs [FOLDER]       the run folders with method, tasks, steps, status, scores and size (default: runs/)
   pack [RUN]          a run without its replay, to give away: config, logs, evaluations, weights (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
@@ -37,6 +51,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "export": export.command,
     "profile": profile.command,
     "report": report.command,
+    "study": study.command,
     "runs": runs.command,
     "pack": pack.command,
     "describe": describe.command,

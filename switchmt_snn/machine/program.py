@@ -10,7 +10,7 @@ from pathlib import Path
 
 NAME = "switchmt-snn"
 _COMMAND = re.compile(
-    rf"(?<![\w/.-]){NAME} (?=(?:train|evaluate|export|profile|report|runs|describe|doctor|check-env)\b)"
+    rf"(?<![\w/.-]){NAME} (?=(?:train|evaluate|play|export|profile|report|study|runs|pack|describe|doctor|check-env)\b)"
 )
 
 

@@ -21,6 +21,8 @@ from switchmt_snn.learning.switching import SwitchingPolicy
 from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.runs.run import load_agent, train
+from switchmt_snn.study.grid import load_study
+from switchmt_snn.study.timing import makespan
 from switchmt_snn.tasks.gym_make import make_environment
 from switchmt_snn.tasks.report import check_env
 from switchmt_snn.viewing.report.curves import running_means, thinned
@@ -37,6 +39,8 @@ EXAMPLES: tuple[Any, ...] = (
     running_means,
     thinned,
     write_report,
+    load_study,
+    makespan,
     file_name,
     json_text,
     make_environment,
