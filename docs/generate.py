@@ -1,4 +1,7 @@
-"""Writes every generated page: ``python -m docs.generate``. The pages are made in docs/tools."""
+"""Writes every generated page: ``python -m docs.generate``. The pages are made in docs/tools.
+
+``python -m docs.gallery`` makes the pictures of docs/gallery.md.
+"""
 
 from docs.tools.pages import main
 

@@ -19,6 +19,7 @@ from docs.tools.atari_page import atari_page
 from docs.tools.commands import commands, repeating
 from docs.tools.control_page import cartpole_page, classic_page
 from docs.tools.energy_page import energy_page
+from docs.tools.gallery import gallery_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
 from docs.tools.pretrained_page import pretrained_page
@@ -352,6 +353,7 @@ def profile_page() -> str:
 PAGES = {
     "docs/configuration.md": configuration_page,
     "docs/energy.md": energy_page,
+    "docs/gallery.md": gallery_page,
     "results/minatar/README.md": minatar_page,
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,

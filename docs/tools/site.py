@@ -35,7 +35,7 @@ def site_page(path: str) -> str | None:
     """The site's page or file for a file of the repository, or None if the site does not show it."""
     if path in _ON_SITE:
         return _ON_SITE[path]
-    inside = path.startswith("docs/") and path.endswith((".md", ".svg", ".png")) and (ROOT / path).exists()
+    inside = path.startswith("docs/") and path.endswith((".md", ".svg", ".png", ".gif")) and (ROOT / path).exists()
     return path.removeprefix("docs/") if inside else None
 
 
