@@ -26,6 +26,8 @@ expected = sys.argv[1]
 assert switchmt_snn.__file__.startswith(expected), switchmt_snn.__file__
 assert switchmt_snn.export.__file__.startswith(expected), switchmt_snn.export.__file__
 assert load_config("paper").name == "paper"
+from switchmt_snn.study.grid import load_study
+assert load_study("policies_minatar", seeds=[1]).baseline == "uniform"
 assert (Path(native.__file__).parent / "csrc" / "numbers.h").is_file()
 assert any(path.name == "loihi-2018.yaml" for path in r.files("switchmt_snn.export.energy.targets").iterdir())
 assert any(path.name == "speck.yaml" for path in r.files("switchmt_snn.export.chips.builtin").iterdir())

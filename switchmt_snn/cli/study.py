@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from switchmt_snn.cli.parsing import parse, split_one
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.errors import ConfigError, SwitchMTError
+from switchmt_snn.machine.program import program
 from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
@@ -30,8 +32,12 @@ class StudyOptions:
     """Seeds in place of those of the file."""
     set: tuple[str, ...] = ()
     """Settings over every trial, each as KEY=VALUE: total_steps=2000."""
+    dry_run: bool = False
+    """Train nothing: measure each kind of trial for half a minute, and say what all will take."""
     status: bool = False
     """Show how far the trials are, and stop."""
+    report: bool = False
+    """Write the report of the trials that have finished by now, and stop."""
     json: bool = False
     """Print the result as JSON (progress goes to stderr)."""
 
@@ -56,8 +62,16 @@ def command(argv: list[str]) -> int:
         study = load_study(source, options.set, options.seeds)
         folder = StudyFolder(options.folder or STUDIES / study.name)
     console = output.console(stderr=options.json)
+    if sum((options.dry_run, options.status, options.report)) > 1:
+        raise ConfigError("study got several of --dry-run, --status and --report, expected one of them")
     if options.status:
         return _status(console, study, folder, options.json)
+    if options.dry_run:
+        return _dry_run(console, study, folder, options)
+    if options.report:
+        folder.require()
+        _report(console, study, folder, options.json)
+        return 0
     return _run(console, study, folder, options)
 
 
@@ -70,6 +84,41 @@ def _status(console: Console, study: Study, folder: StudyFolder, as_json: bool) 
     else:
         console.print(status_table(facts))
     return 0
+
+
+def _dry_run(console: Console, study: Study, folder: StudyFolder, options: StudyOptions) -> int:
+    from switchmt_snn.study.estimate import cost_facts, cost_table
+    from switchmt_snn.study.local import jobs_for
+    from switchmt_snn.study.probe import probe
+
+    jobs = jobs_for(study.trials, options.jobs)
+    trials = study.trials
+    if folder.is_study:
+        trials = tuple(one.trial for one in folder.progress(study) if one.status != "finished")
+    costs = probe(trials, jobs, lambda text: console.print(text, highlight=False, soft_wrap=True))
+    facts = cost_facts(study, trials, costs, jobs, folder.path)
+    if options.json:
+        print(json_text(facts, indent=1))
+    else:
+        console.print(cost_table(facts))
+    return 0
+
+
+def _report(console: Console, study: Study, folder: StudyFolder, as_json: bool) -> None:
+    """The report of what has finished; a study that trained well does not fail because its page cannot be written."""
+    from switchmt_snn.study.report import write_study_report
+
+    try:
+        page = write_study_report(study, folder)
+    except SwitchMTError as error:
+        console.print(f"no report: {error}", highlight=False, soft_wrap=True)
+        return
+    if page is None:
+        console.print("no report: no trial has finished", highlight=False)
+        return
+    console.print(f"tables: {folder.path / 'tables.md'}; report: {page}", highlight=False, soft_wrap=True)
+    if as_json:
+        print((folder.path / "study.json").read_text("utf-8"))
 
 
 def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOptions) -> int:
@@ -93,6 +142,16 @@ def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOpti
         with stop_requests() as requested:
             failed = run_trials(waiting, folder, jobs, screen, requested)
             stopped = requested()
+        _report(console, study, folder, options.json)
     finally:
         lock.release()
+    _say_how_to_go_on(console, folder, stopped, [trial.name for trial in failed])
     return 130 if stopped else 1 if failed else 0
+
+
+def _say_how_to_go_on(console: Console, folder: StudyFolder, stopped: bool, failed: list[str]) -> None:
+    again = f"{program()} study {shlex.quote(str(folder.path))}"
+    if failed:
+        console.print(f"failed: {', '.join(failed)}; try them again with: {again}", highlight=False, soft_wrap=True)
+    elif stopped:
+        console.print(f"stopped; continue exactly here with: {again}", highlight=False, soft_wrap=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.config.checks import require
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.study.folder import Attempt, StudyFolder, TrialRun, moment
@@ -137,22 +138,30 @@ def _next(waiting: deque[Trial], running: int, jobs: int, folder: StudyFolder) -
 
 
 def _start(trial: Trial, folder: StudyFolder) -> _Running:
-    command = [sys.executable, "-m", "switchmt_snn", "train"]
-    command += [str(folder.config(trial)), "--run", str(folder.run(trial))]
-    threads = str(trial.config.threads or 1)
-    environment = {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
     steps = TrialRun(folder.run(trial)).steps
     with folder.log(trial).open("ab") as log:
         process = subprocess.Popen(
-            command,
+            command_of(["train", str(folder.config(trial)), "--run", str(folder.run(trial))]),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **environment},
+            env=environment_of(trial.config),
             start_new_session=True,  # Ctrl-C reaches the study alone, which asks its trials once
             preexec_fn=_stop_with_parent if sys.platform == "linux" else None,
         )
     return _Running(trial, process, time.monotonic(), steps)
+
+
+def command_of(words: Sequence[str]) -> list[str]:
+    """A command of this program, by this Python."""
+    return [sys.executable, "-m", "switchmt_snn", *words]
+
+
+def environment_of(config: ExperimentConfig) -> dict[str, str]:
+    """The environment of a trial's process: no library begins more threads than the trial has."""
+    threads = str(config.threads or 1)
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    return {**os.environ, **dict.fromkeys(names, threads)}
 
 
 def _stop_with_parent() -> None:

@@ -87,6 +87,7 @@ def test_a_study_that_is_killed_goes_on_as_if_it_had_not_been(tmp_path: Path) ->
     children[0].kill()
     process.communicate()
     psutil.wait_procs(children)
+    assert not (tmp_path / "killed" / "tables.md").exists()
     status = json.loads(
         subprocess.run(
             study_command(path, "--folder", "killed", "--status", "--json"),
@@ -110,6 +111,11 @@ def test_a_study_that_is_killed_goes_on_as_if_it_had_not_been(tmp_path: Path) ->
     code, out = ended(begin(tmp_path / "killed", cwd=tmp_path))  # the folder itself is a study, too
     assert code == 0, out
     assert "2 finished" in out
+    code, out = ended(begin(path, "--folder", "whole", cwd=tmp_path))
+    assert code == 0, out
+    for name in ("tables.md", "study.json", "trials.csv", "scores.csv", "curves.csv"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert "All 2 trials finished." in (tmp_path / "killed" / "report.html").read_text()
 
 
 @pytest.mark.slow
@@ -200,6 +206,23 @@ variants:
     }
 
 
+@pytest.mark.slow
+def test_a_dry_run_measures_each_kind_and_leaves_nothing(tmp_path: Path) -> None:
+    path = tiny(tmp_path / "s.yaml", "vary: {switching.visit_episodes: [3, 4], network.timesteps: [1, 2]}\nseeds: 2\n")
+    process = begin(path, "--folder", "s", "--jobs", "1", "--dry-run", "--json", cwd=tmp_path)
+    code, out = ended(process)
+    assert code == 0, out
+    facts = json.loads(out[out.index("{") :])
+    assert (facts["trials"], facts["finished"], facts["jobs"]) == (8, 0, 1)
+    assert out.count("probing ") == 2  # switching and seeds are no other kind
+    assert facts["core_seconds"] == pytest.approx(facts["seconds"])
+    assert facts["seconds"] == pytest.approx(sum(row["seconds"] * row["trials"] for row in facts["variants"]))
+    assert facts["seconds"] > 8
+    assert facts["disk_bytes"] > 8 * 10_000
+    assert 100 * 2**20 < facts["memory_bytes"] < facts["memory_available_bytes"]
+    assert not (tmp_path / "s").exists()
+
+
 def test_more_jobs_than_cores_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(local, "free_cores", lambda: 4)
     trials = load_study(tiny(tmp_path / "s.yaml", "")).trials
@@ -242,6 +265,8 @@ def test_a_folder_takes_more_trials_but_no_other_ones(tmp_path: Path) -> None:
         ([], "study got no CONFIG, expected a YAML file or one of policies_minatar"),
         (["nothing.yaml"], "no study 'nothing.yaml', expected a YAML file or a study's name"),
         (["policies_minatar", "--status"], "no study in runs/studies/policies_minatar, expected one; begin it with"),
+        (["policies_minatar", "--report"], "no study in runs/studies/policies_minatar, expected one; begin it with"),
+        (["policies_minatar", "--report", "--dry-run"], "study got several of --dry-run, --status and --report"),
         (["policies_minatar", "--jobs", "1000"], "--jobs is 1000, expected 1 to "),
     ],
 )

@@ -40,13 +40,18 @@ def grouped(runs: Sequence[Sources]) -> tuple[list[Group], dict[str, list[Any]]]
                 break
         else:
             parts.append([run])
-    firsts = [part[0].config for part in parts]
-    keys = [key for one in firsts for key in differences(firsts[0], one) if key not in _SAME]
-    differing = {key: [_value(one, key) for one in firsts] for key in sorted(dict.fromkeys(keys), key=_weight)}
+    differing = differing_settings(parts)
     labels = [_label(part[0], differing, index) for index, part in enumerate(parts)]
     if len(set(labels)) < len(labels):
         labels = [f"{label} ({part[0].folder.path.name})" for label, part in zip(labels, parts, strict=True)]
     return [Group(label, tuple(part)) for label, part in zip(labels, parts, strict=True)], differing
+
+
+def differing_settings(parts: Sequence[Sequence[Sources]]) -> dict[str, list[Any]]:
+    """The settings in which groups of runs differ, with each group's value."""
+    firsts = [part[0].config for part in parts]
+    keys = [key for one in firsts for key in differences(firsts[0], one) if key not in _SAME]
+    return {key: [_value(one, key) for one in firsts] for key in sorted(dict.fromkeys(keys), key=_weight)}
 
 
 def _weight(key: str) -> tuple[bool, bool, str]:

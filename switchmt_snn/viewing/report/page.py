@@ -16,9 +16,15 @@ from switchmt_snn.drawing.page import page_environment
 from switchmt_snn.drawing.svg import inline_svg
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.files import json_text, write_atomically
-from switchmt_snn.viewing.report.comparison import comparison_facts, comparison_figures, grouped
+from switchmt_snn.viewing.report.comparison import (
+    Group,
+    comparison_facts,
+    comparison_figures,
+    differing_settings,
+    grouped,
+)
 from switchmt_snn.viewing.report.facts import figures_of, run_facts
-from switchmt_snn.viewing.report.sources import read_sources
+from switchmt_snn.viewing.report.sources import Sources, read_sources
 
 
 def write_report(runs: Sequence[str | Path], out: str | Path | None = None, figures: bool = False) -> Path:
@@ -57,12 +63,57 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None, figu
         charts = list(compared)
         name, drawn = "comparison", {"learning": charts}
     page = _rendered(f"{name}.html.jinja", facts, drawn)
+    figure_folder = "figures" if name == "report" else "comparison_figures"
+    return _write(folder, name, page, facts, charts if figures else [], figure_folder)
+
+
+def write_comparison(
+    groups: dict[str, Sequence[Sources]],
+    out: Path,
+    title: str,
+    headline: str,
+    tables: Sequence[dict[str, Any]] = (),
+    name: str = "report",
+) -> Path:
+    """Write the page of several runs whose groups are known, with tables in place of the scores.
+
+    Args:
+        groups: runs by the group's label; none is empty.
+        out: folder to write to.
+        title: of the page.
+        headline: the line below it.
+        tables: each with ``title``, ``note``, ``columns`` and ``rows`` of texts.
+        name: of the files, and of the folder of figures (SVG, PNG by Pillow, CSV) with ``_figures`` behind it.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        RunFolderError: the folder cannot be written.
+    """
+    compared = [Group(label, tuple(runs)) for label, runs in groups.items()]
+    charts = comparison_figures(compared)
+    facts = comparison_facts(compared, differing_settings([group.runs for group in compared]), charts)
+    facts |= {"title": title, "headline": headline, "tables": list(tables)}
+    page = _rendered("comparison.html.jinja", facts, {"learning": list(charts)})
+    return _write(out, name, page, facts, charts, f"{name}_figures")
+
+
+def _write(
+    folder: Path,
+    name: str,
+    page: str,
+    facts: dict[str, Any],
+    charts: Sequence[Chart | Timeline],
+    figure_folder: str,
+) -> Path:
+    """The page, its JSON and its figures; returns the page's path."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / f"{name}.json", json_text(facts, indent=1).encode())
         write_atomically(folder / f"{name}.html", page.encode())
-        if figures:
-            _write_figures(folder / ("figures" if name == "report" else "comparison_figures"), charts)
+        if charts:
+            _write_figures(folder / figure_folder, charts)
     except OSError as error:
         raise RunFolderError(
             f"{folder} cannot be written ({error.strerror or error}), expected a writable folder; name "

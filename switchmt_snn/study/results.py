@@ -1,0 +1,142 @@
+"""What the trials of a study came to, read from their run folders: the rows of tables, CSV files and statistics.
+
+Nothing here depends on time or machine: a study that was interrupted gives the same rows.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from switchmt_snn.acting.evaluation import EvaluationProtocol
+from switchmt_snn.study.folder import StudyFolder, TrialRun
+from switchmt_snn.study.grid import Study, Trial
+from switchmt_snn.viewing.report.sources import Sources, read_sources
+from switchmt_snn.viewing.report.switching import visits
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """One task of one finished trial.
+
+    Attributes:
+        mean: raw return of the agent in the final evaluation; ``random_mean`` that of random play in the same.
+        standard_error: over its episodes; None with one episode.
+        steps: agent steps in the task.
+        updates: gradient steps of the run while the task was played. With ``learning.update_tasks: all`` all tasks
+            share them.
+        visits: how often the task was entered.
+        curve: step and mean return of the evaluations during training, and last of the final one.
+    """
+
+    trial: str
+    variant: str
+    seed: int
+    task: str
+    mean: float
+    standard_error: float | None
+    random_mean: float | None
+    episodes: int
+    steps: int
+    updates: int
+    visits: int
+    curve: tuple[tuple[int, float], ...]
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """One finished trial.
+
+    Attributes:
+        step: at which it ended.
+        updates: gradient steps of the run.
+        switches: how often it went to another task.
+        protocol: of the final evaluation, in words.
+        run: all that was read of it.
+    """
+
+    trial: Trial
+    step: int
+    updates: int
+    switches: int
+    protocol: str
+    tasks: tuple[TaskResult, ...]
+    run: Sources = field(repr=False, compare=False)
+
+
+def read_results(study: Study, folder: StudyFolder) -> list[TrialResult]:
+    """The finished trials, in the study's order.
+
+    Raises:
+        RunFolderError: a log of a finished trial cannot be read.
+    """
+    found = []
+    for trial in study.trials:
+        final = TrialRun(folder.run(trial)).final
+        if final is not None:
+            found.append(_result(trial, read_sources(folder.run(trial)), final))
+    return found
+
+
+def _result(trial: Trial, run: Sources, final: dict[str, Any]) -> TrialResult:
+    stays = visits(run)
+    counted = [(one.step, one.updates) for one in run.history.episodes]
+    counted = sorted({*counted, *((one.step, one.updates) for one in run.history.measured)})
+    rows = {(row["task"], row["policy"]): row for row in final["tasks"]}
+    tasks = []
+    for index, task in enumerate(run.tasks):
+        own = [visit for visit in stays if visit.task == index]
+        agent, random = rows[task, "agent"], rows.get((task, "random"))
+        error = agent.get("standard_error")
+        tasks.append(
+            TaskResult(
+                trial=trial.name,
+                variant=trial.variant,
+                seed=trial.seed,
+                task=task,
+                mean=agent["mean"],
+                standard_error=None if error is None else float(error),
+                random_mean=None if random is None else random["mean"],
+                episodes=int(agent["episodes"]),
+                steps=sum(visit.end - visit.begin for visit in own),
+                updates=sum(_updates_at(counted, visit.end) - _updates_at(counted, visit.begin) for visit in own),
+                visits=len(own),
+                curve=_curve(run, final, task),
+            )
+        )
+    return TrialResult(
+        trial=trial,
+        step=int(final["step"]),
+        updates=run.history.updates,
+        switches=len(stays) - 1,
+        protocol=str(EvaluationProtocol.from_dict(final["protocol"])),
+        tasks=tuple(tasks),
+        run=run,
+    )
+
+
+def _updates_at(counted: Sequence[tuple[int, int]], step: int) -> int:
+    """Updates that the newest log line up to a step names."""
+    place = bisect_right(counted, step, key=lambda one: one[0])
+    return counted[place - 1][1] if place else 0
+
+
+def _curve(run: Sources, final: dict[str, Any], task: str) -> tuple[tuple[int, float], ...]:
+    """Evaluations during training, and the final one."""
+    asked = run.config.evaluation
+    wanted = (asked.episodes, asked.epsilon, asked.seed)
+    points = {}
+    for one in run.evaluations:
+        played = tuple(one["protocol"].get(key) for key in ("episodes", "epsilon", "seed"))
+        mean = _mean(one, task)
+        if played == wanted and mean is not None and one["step"] < final["step"]:
+            points[int(one["step"])] = mean
+    last = _mean(final, task)
+    return tuple(sorted(points.items())) + (() if last is None else ((int(final["step"]), last),))
+
+
+def _mean(evaluation: dict[str, Any], task: str) -> float | None:
+    means = [row["mean"] for row in evaluation["tasks"] if (row["policy"], row["task"]) == ("agent", task)]
+    return float(means[0]) if means else None
