@@ -30,6 +30,7 @@ from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAge
 from switchmt_snn.runs.evaluations import evaluation_name
 from switchmt_snn.runs.files import file_name, json_text, write_atomically, written_whole
 from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.model_card import CARD, model_card
 from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.run import load_agent
@@ -87,7 +88,7 @@ def export(
     out: str | Path | None = None,
     note: Note = lambda text: None,
 ) -> ExportResult:
-    """Write a run's network as ONNX and NIR files and check them.
+    """Write a run's network as ONNX and NIR files, check them, and say in ``MODEL_CARD.md`` what they are.
 
     Args:
         run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
@@ -117,7 +118,8 @@ def export(
         note(f"left out {name.upper()}: {reason}")
     folder = _made(Path(out) if out is not None else run_folder.path / "export")
     facts = provenance(run_folder.path) | {"weights": "int8" if settings.int8 else "float32"}
-    (folder / "parity.json").unlink(missing_ok=True)  # of the files that are replaced now
+    for name in ("parity.json", CARD):  # of the files that are replaced now
+        (folder / name).unlink(missing_ok=True)
     files = _write_onnx(built.models, folder, facts) | _write_nir(built.graphs, exported, folder, facts)
     for name, path in files.items():
         note(f"wrote {path} ({name})")
@@ -140,6 +142,10 @@ def export(
             f"parity failed: {'; '.join(parity['failures'])}; expected the trained network's decisions; see "
             f"{folder / 'parity.json'}"
         )
+    beside = {path.name: path for file in files.values() if (path := file.with_suffix(".json")).is_file()}
+    card = model_card(run_folder, checkpoint, files | beside | {"parity.json": folder / "parity.json"}, facts | parity)
+    write_atomically(folder / CARD, card.encode())
+    note(f"wrote {folder / CARD}")
     return ExportResult(folder, files, parity, built.left_out)
 
 

@@ -22,7 +22,7 @@ from docs.tools.energy_page import energy_page
 from docs.tools.gallery import gallery_page
 from docs.tools.performance_page import performance_page
 from docs.tools.picture import picture
-from docs.tools.pretrained_page import pretrained_page
+from docs.tools.pretrained_page import pretrained_cards, pretrained_page
 from docs.tools.profile_spread import spread
 from docs.tools.recipe_page import recipe_page
 from switchmt_snn.acting.evaluation import EvaluationProtocol
@@ -359,6 +359,7 @@ PAGES = {
     "results/profile/README.md": profile_page,
     "results/recipe/README.md": recipe_page,
     "switchmt_snn/pretrained/README.md": pretrained_page,
+    **pretrained_cards(),
     "results/atari/README.md": atari_page,
     "results/cartpole/README.md": cartpole_page,
     "results/classic/README.md": classic_page,

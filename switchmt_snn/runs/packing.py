@@ -9,12 +9,21 @@ from pathlib import Path
 from switchmt_snn.errors import RunFolderError, nearest
 from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.runs.folder import RunFolder, latest_run, unwritable
+from switchmt_snn.runs.model_card import CARD, model_card
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Packed runs of the package: one folder each."""
 
 _PREFIX = "pretrained"
-_FILES = ("config.yaml", "environment.json", "code_changes.jsonl", "metrics.jsonl", "episodes.csv", "switches.csv")
+_FILES = (
+    "config.yaml",
+    "environment.json",
+    "code_changes.jsonl",
+    "metrics.jsonl",
+    "episodes.csv",
+    "switches.csv",
+    "profile/profile.json",
+)
 
 
 def pretrained_names() -> list[str]:
@@ -55,6 +64,8 @@ def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder
 def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> Path:
     """Copy what others need of a run: config, logs, evaluations and the weights of one checkpoint, without the replay.
 
+    A model card (``MODEL_CARD.md``) says what it is; its energy comes from the run's profile.
+
     The copy is a run folder for every command that reads one. Training cannot be continued from it: that needs the
     replay, the optimizer's moments and the environments' states.
 
@@ -81,11 +92,13 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
             packed.path.mkdir()
             for name in _FILES:
                 if (folder.path / name).is_file():
+                    (packed.path / name).parent.mkdir(exist_ok=True)
                     write_atomically(packed.path / name, (folder.path / name).read_bytes())
             for path in sorted(folder.evaluations.folder.glob(f"step-{step:012d}_*")):
                 (packed.path / "evaluations").mkdir(exist_ok=True)
                 write_atomically(packed.path / "evaluations" / path.name, path.read_bytes())
             packed.checkpoints().save_weights(step, weights)
+            write_atomically(packed.path / CARD, model_card(packed).encode())
             packed.path.rename(out)
     except OSError as error:
         raise RunFolderError(unwritable(out, error)) from error

@@ -27,6 +27,7 @@ def test_export_writes_checks_and_the_files_play(trained_run: Path, run_command:
         "asterix.nir",
         "asterix.json",
         "parity.json",
+        "MODEL_CARD.md",
     }
     parity = json.loads((folder / "parity.json").read_text())
     assert parity["failures"] == []
