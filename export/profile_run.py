@@ -29,6 +29,7 @@ from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
+from switchmt_snn.export.report.verdict import silent_layers, verdict
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.runs.environment import command_line
 from switchmt_snn.runs.files import json_text, write_atomically
@@ -210,6 +211,8 @@ def _written(
         "command": command_line(),
         "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         **facts,
+        "verdict": verdict(tasks),
+        "warnings": silent_layers(tasks, profiles[0].spiking),
         "spiking": profiles[0].spiking,
         "summary": summary,
         "targets": {target.name: asdict(target) for target in targets},

@@ -48,9 +48,9 @@ def microjoule(value_pj: float) -> str:
     return digits(value_pj / 1e6)
 
 
-def millijoule(value_pj: float) -> str:
-    """Picojoule as millijoule."""
-    return digits(value_pj / 1e9)
+def joule(value_pj: float) -> str:
+    """Picojoule as joule."""
+    return digits(value_pj / 1e12)
 
 
 def thousandth(value: float) -> str:
@@ -58,7 +58,7 @@ def thousandth(value: float) -> str:
     return digits(value / 1e3)
 
 
-FILTERS = PAGE_FILTERS | {filter.__name__: filter for filter in (microjoule, millijoule, thousandth)}
+FILTERS = PAGE_FILTERS | {filter.__name__: filter for filter in (microjoule, joule, thousandth)}
 
 
 def _raster(layer: dict[str, Any], timesteps: int) -> str:

@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,9 @@ from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.numbers import exact
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.files import file_name, json_text, write_atomically
+
+CLEARLY_ABOVE = 1.96
+"""Standard errors of the difference of two means by which an agent must lead random play to be called better."""
 
 
 def evaluation_name(evaluation: Evaluation) -> str:
@@ -64,7 +68,8 @@ class Evaluations:
         """What this step's weights are worth in a task: the evaluation with the most episodes; of equals the last name.
 
         Returns:
-            ``episodes``, ``score``, ``random_score``, ``decisions_per_episode`` and ``protocol`` (in words), or None.
+            ``episodes``, ``score``, ``random_score``, ``better_than_random`` (None if standard errors are missing),
+            ``decisions_per_episode`` and ``protocol`` (in words), or None.
 
         Raises:
             RunFolderError: a file is no evaluation.
@@ -77,6 +82,7 @@ class Evaluations:
                     "episodes": rows["agent"]["episodes"],
                     "score": rows["agent"]["mean"],
                     "random_score": rows["random"]["mean"],
+                    "better_than_random": better_than_random(stored, task),
                     "decisions_per_episode": rows["agent"]["mean_length_steps"],
                     "protocol": str(EvaluationProtocol.from_dict(stored["protocol"])),
                 }
@@ -93,6 +99,18 @@ class Evaluations:
     def _at(self, step: int) -> list[dict[str, Any]]:
         """The stored summaries of a step, in order of their names."""
         return [_read(path) for path in sorted(self.folder.glob(f"{_step_name(step)}_*.json"))]
+
+
+def better_than_random(stored: Mapping[str, Any], task: str) -> bool | None:
+    """Whether an evaluation's agent leads random play clearly (``CLEARLY_ABOVE``); None if it does not say."""
+    rows = {row["policy"]: row for row in stored["tasks"] if row["task"] == task}
+    if not {"agent", "random"} <= rows.keys():
+        return None
+    agent, random = rows["agent"], rows["random"]
+    if agent.get("standard_error") is None or random.get("standard_error") is None:
+        return None
+    spread = (float(agent["standard_error"]) ** 2 + float(random["standard_error"]) ** 2) ** 0.5
+    return bool(agent["mean"] - random["mean"] > CLEARLY_ABOVE * spread)
 
 
 def _step_name(step: int) -> str:

@@ -11,13 +11,12 @@ from switchmt_snn import __version__
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig
 from switchmt_snn.drawing.numbers import bytes_of, digits, duration, percent, whole
+from switchmt_snn.runs.evaluations import better_than_random
 from switchmt_snn.runs.files import sha256
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.history import History, read_history
 
 CARD = "MODEL_CARD.md"
-CLEARLY_ABOVE = 1.96
-"""Standard errors of the difference of two means by which an agent must lead random play to be called better."""
 
 
 def model_card(
@@ -218,18 +217,6 @@ def _limits(
                 silent = f"{layer['silent']:,} of {layer['neurons']:,} neurons of {layer['name']} never fire"
                 lines.append(f"In {task['task']} {silent}: low energy then says little.")
     return ["## Limits", "", *(f"- {line}" for line in lines), ""]
-
-
-def better_than_random(stored: Mapping[str, Any], task: str) -> bool | None:
-    """Whether an evaluation's agent leads random play clearly (``CLEARLY_ABOVE``); None if it does not say."""
-    rows = {row["policy"]: row for row in stored["tasks"] if row["task"] == task}
-    if not {"agent", "random"} <= rows.keys():
-        return None
-    agent, random = rows["agent"], rows["random"]
-    if agent.get("standard_error") is None or random.get("standard_error") is None:
-        return None
-    spread = (float(agent["standard_error"]) ** 2 + float(random["standard_error"]) ** 2) ** 0.5
-    return bool(agent["mean"] - random["mean"] > CLEARLY_ABOVE * spread)
 
 
 def _hash_lines(run: RunFolder, step: int, environment: Mapping[str, Any], files: Mapping[str, Path]) -> list[str]:

@@ -79,7 +79,7 @@ def numbers_that_may_stand(facts: Any) -> set[str]:
 def check(path: Path, facts: Any) -> Page:
     page = Page(path.read_text())
     assert page.open == []
-    assert all(address.startswith("data:") for address in page.addresses), "an address outside the page"
+    assert all(address.startswith(("data:", "#")) for address in page.addresses), "an address outside the page"
     allowed = numbers_that_may_stand(facts) | {str(sum(1 for _ in facts.get("runs", [1])))}
     strange = {number for text in page.text for number in NUMBER.findall(text)} - allowed
     # A list of neurons is told by its length.

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from switchmt_snn.export import ExportSettings, export
-from switchmt_snn.runs.model_card import CARD, better_than_random, model_card
+from switchmt_snn.runs.evaluations import better_than_random
+from switchmt_snn.runs.model_card import CARD, model_card
 from switchmt_snn.runs.packing import PRETRAINED, open_run, pretrained_names
 
 
