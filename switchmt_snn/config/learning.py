@@ -102,6 +102,9 @@ class LearningConfig:
     """Steps of the linear decay from start to end."""
     epsilon_clock: Literal["total", "task"] = "total"
     """Count the decay in steps of the whole run (paper), or in steps of the task that is played."""
+    longest_random_action_steps: int = 1
+    """A random action is kept for n steps, with probability proportional to 1/n^2, at most so many. Epsilon is then the
+    probability of beginning one. 1: one step (paper). 100 finds rewards that need a held action (Enduro)."""
 
     def __post_init__(self) -> None:
         check_fields(self, "learning")
@@ -123,6 +126,7 @@ class LearningConfig:
             "target_update_every_steps",
             "target_update_every_updates",
             "epsilon_decay_steps",
+            "longest_random_action_steps",
         ):
             value = getattr(self, name)
             require(value is None or value >= 1, f"learning.{name}", value, "at least 1")

@@ -20,6 +20,7 @@ from switchmt_snn.config import ExperimentConfig, clips_rewards
 from switchmt_snn.errors import TrainingFailed, require_saved
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
+from switchmt_snn.learning.exploration import Exploration
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.measuring import layer_health, updates_to_settle
 from switchmt_snn.learning.return_scale import make_return_scales
@@ -61,6 +62,7 @@ class Training(Stateful):
         "episodes_by_task",
         "starts_by_task",
         "explore_rng",
+        "exploration",
         "sample_rng",
         "update_clock",
         "target_clock",
@@ -100,6 +102,7 @@ class Training(Stateful):
         self.episodes_by_task = [0] * num_tasks  # episodes that ended
         self.starts_by_task = [0] * num_tasks  # episodes that began; numbers their seeds
         self.explore_rng = np.random.default_rng(seeds[1])
+        self.exploration = Exploration(num_tasks, self.num_envs, config.learning.longest_random_action_steps)
         self.sample_rng = np.random.default_rng(seeds[2])
         self.update_clock = Every(config.learning.update_every_steps)
         learning = config.learning
@@ -147,8 +150,7 @@ class Training(Stateful):
     def select_actions(self, play: Play, epsilon: float) -> npt.NDArray[np.int64]:
         """Epsilon-greedy over the actions that exist in the task; the same random draws whatever the network says."""
         valid = np.flatnonzero(self.suite.valid_actions_KA[self.task])
-        explore = self.explore_rng.random(self.num_envs) < epsilon
-        actions = valid[self.explore_rng.integers(0, len(valid), self.num_envs)]
+        explore, actions = self.exploration.choose(self.task, valid, epsilon, self.explore_rng)
         if not explore.all():
             greedy = self.learner.act(play.observations, self.task)
             actions = np.where(explore, actions, greedy)
@@ -209,6 +211,7 @@ class Training(Stateful):
         task = self.task
         switch: SwitchTo | None = None
         for env in played.ended:
+            self.exploration.end(task, int(env))
             self.episodes_by_task[task] += 1
             self.episodes_in_visit += 1
             episode_return = float(play.returns[env])
@@ -362,7 +365,12 @@ class Training(Stateful):
             CheckpointError: the state is not whole, or of another run.
         """
         require_saved(state, ("plays",), type(self).__name__)
-        older = {"return_scales": [], "updates_in_visit": 0}  # what states of older versions lack, and do not use
+        older: dict[str, Any] = {
+            "return_scales": [],
+            "updates_in_visit": 0,
+        }  # what states of older versions lack, and do not use
+        if self.exploration.longest_steps == 1:
+            older["exploration"] = self.exploration.state_dict()
         super().load_state_dict({**older, **state})
         replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]
         self.reproducible = all(replayed)

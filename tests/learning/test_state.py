@@ -70,7 +70,13 @@ def test_whatever_is_missing_is_one_line(state: dict[str, Any]) -> None:
         parent.update(items)
     assert {place for place, text in messages.items() if "\n" in text or "expected" not in text} == set()
     # What states of older versions lack; a task that was never visited is not in play.
-    assert accepted == {("updates_in_visit",), ("policy", "criterion", "updates"), ("plays", "0"), ("plays", "1")}
+    assert accepted == {
+        ("updates_in_visit",),
+        ("exploration",),
+        ("policy", "criterion", "updates"),
+        ("plays", "0"),
+        ("plays", "1"),
+    }
 
 
 Damage = Callable[[dict[str, Any]], None]
