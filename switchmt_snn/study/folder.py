@@ -79,7 +79,10 @@ class StudyFolder:
     @property
     def is_study(self) -> bool:
         """Whether a study lives here."""
-        return (self.path / "trials.json").is_file()
+        try:
+            return (self.path / "trials.json").is_file()
+        except (OSError, ValueError):  # a path that no file system takes
+            return False
 
     def require(self) -> StudyFolder:
         """This folder, if it holds a study.

@@ -158,11 +158,19 @@ def _text_of(source: str | Path) -> tuple[str, str, Path | None]:
     """Text, name for errors, and path of a study; the path is None for one of the package."""
     path, where = Path(source), printable(source)
     packaged = _packaged()
-    if path.is_file():
+    if _is_file(path):
         return read_text(path, _WHAT), where, path
     if path.suffix in ("", ".yaml") and path.parts[:-1] in ((), ("configs", "studies")) and path.stem in packaged:
         return packaged[path.stem], where, None
     raise ConfigError(f"no study {where!r}, expected a YAML file or a study's name{did_you_mean(path.stem, packaged)}")
+
+
+def _is_file(path: Path) -> bool:
+    """Whether a file is there; False for a path that no file system takes."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _packaged() -> dict[str, str]:
@@ -196,7 +204,7 @@ def _study_file(text: str, where: str, path: Path | None) -> StudyFile:
 
 def _base(source: str, study: Path | None) -> ExperimentConfig:
     beside = None if study is None else study.parent / source
-    return load_config(beside if beside is not None and beside.is_file() else source)
+    return load_config(beside if beside is not None and _is_file(beside) else source)
 
 
 def _settings(value: Any, where: str) -> dict[str, Any]:

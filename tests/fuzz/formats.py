@@ -19,6 +19,7 @@ from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.files import file_name
+from switchmt_snn.study.grid import load_study
 from switchmt_snn.tasks.registry import make_suite
 from tests.export.chip_networks import chain
 from tests.fuzz.mutations import mutant, text_mutant
@@ -110,6 +111,16 @@ def _read_config(folder: Path, content: bytes, number: int) -> None:
         describe_method(resolved, make_suite(resolved.tasks))
 
 
+def _read_study(folder: Path, content: bytes, number: int) -> None:
+    path = folder / "mutant.yaml"
+    path.write_bytes(content)
+    study = load_study(path)
+    assert len({trial.name for trial in study.trials}) == len(study.trials)
+    for trial in study.trials[:20]:
+        (folder / trial.name).touch()
+        resolve(trial.config)
+
+
 def _read_target(folder: Path, content: bytes, number: int) -> None:
     path = folder / "mutant.yaml"
     path.write_bytes(content)
@@ -132,8 +143,21 @@ def _files(*patterns: str) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in paths}
 
 
+GRID = b"""# A grid
+base: classic
+name: grid
+settings: {network: {timesteps: 2}, total_steps: 500}
+variants: {both: {}, alone: {tasks.names: [CartPole-v1], evaluation.stop_at_returns: []}}
+vary: {switching.policy: [interleave, fixed_steps], learning.learning_rate: [1e-4, 0.01]}
+seeds: [3, 1]
+references: {CartPole-v1: 500, Acrobot-v1: -100.5}
+baseline: both_policy-interleave_learning_rate-1e-4
+"""
+"""A study with every key."""
+
 FORMATS = {
     "config": Format(_files("configs/*.yaml", "tests/fixtures/runs/*/config.yaml", "examples/*.yaml"), _read_config),
+    "study": Format({**_files("configs/studies/*.yaml"), "grid": GRID}, _read_study),
     "target": Format(_files("export/energy/targets/*.yaml", "export/chips/builtin/*.yaml"), _read_target),
     "task-id": Format({name: name.encode() for name in TASK_IDS}, _read_task_id, _task_id_mutant),
 }

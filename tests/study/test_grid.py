@@ -169,6 +169,7 @@ REFUSED = {
     ),
     "unknown baseline": ("base: cartpole\nbaseline: x\n", "baseline is 'x', expected one of mine"),
     "wrong type": ("base: cartpole\nvariants: [a]\n", "variants is ['a'], expected a mapping"),
+    "endless base": (f"base: {'9' * 500}x\n", "no config file or preset '999"),
     "tag": ("base: !!python/name:os.system cartpole\n", "is not YAML that is taken here"),
 }
 
@@ -202,3 +203,5 @@ def test_an_unknown_study_is_named_with_the_nearest() -> None:
         ConfigError, match="no study 'policies_minata', expected a YAML file or a study's name; did you"
     ):
         load_study("policies_minata")
+    with pytest.raises(ConfigError, match="no study 'xxx"):
+        load_study("x" * 5000)
