@@ -36,6 +36,8 @@ LARGEST: dict[str, float] = {
     "learning.reestimate_statistics_batches": 10**6,
     "switching.window_episodes": 10**6,
     "switching.plateau_window_episodes": 10**6,
+    "switching.probe_observations": 4_096,
+    "switching.score_episodes": 10**6,
     "evaluation.episodes": 10**6,
     "evaluation.num_envs": 4_096,
     "evaluation.max_episode_steps": 10**9,

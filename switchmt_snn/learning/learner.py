@@ -304,6 +304,17 @@ class Learner(Stateful):
             self.network(self._tensor(observations), task, activity=activity, generator=generator)
         return {name: spikes.mean(dim=(0, 1)).flatten() for name, spikes in activity.items()}
 
+    def q_values(self, observations: npt.NDArray[np.generic] | Tensor, task: int) -> Tensor:
+        """Q-values ``[B, A]`` of the network that learns, for the task's valid actions, in eval mode; on the CPU.
+
+        Draws its own random numbers, the same ones each time, so looking does not change training.
+        """
+        self.network.eval()
+        with torch.inference_mode():
+            generator = torch.Generator(self.device).manual_seed(0)
+            q_BA = self.network(self._tensor(observations).to(self.device), task, generator=generator)
+        return cast(Tensor, q_BA[:, ~self._invalid_KA[task]].to("cpu", torch.float32, copy=True))
+
     def _tensor(self, array: npt.NDArray[np.generic] | Tensor) -> Tensor:
         return array if isinstance(array, Tensor) else to_device(array, self.device)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,7 @@ class Training(Stateful):
         self.learner = make_learner(config, suite, device, group)  # Q, Q*
         self.replays = [make_replay(config, suite, device) for _ in suite.names]  # D_1 ... D_|E|
         self.return_scales = make_return_scales(config, num_tasks)
-        self.policy = SwitchingPolicy(config.switching, num_tasks)
+        self.policy = SwitchingPolicy(config.switching, num_tasks, [suite.references.get(name) for name in suite.names])
         self.task = 0
         self.visit = 0
         self.steps = 0
@@ -233,19 +234,27 @@ class Training(Stateful):
                 updates_in_visit=self.updates_in_visit,
                 episode_return=episode_return,
                 parameters=self.learner.parameters,
+                observations=partial(self._observations, task),
+                values=partial(self.learner.q_values, task=task),
             )
             decision = self.policy.judge(record, left=switch is not None)
             yield self._decided(decision)
             if isinstance(decision, SwitchTo):
                 switch = decision
         if switch is None and self.policy.must_leave(self.steps_in_visit):
-            switch = self.policy.leave(task)
+            switch = self.policy.leave(task, self.steps_in_visit)
             yield self._decided(switch)
         if switch is not None:
             self.policy.start_visit()
             self._enter(switch.task)
         else:
             self._begin_episodes()
+
+    def _observations(self, task: int, count: int) -> Tensor:
+        """Observations of a task's replay for its criterion; the step seeds the draw."""
+        rng = np.random.default_rng((self.config.seed, self.steps, task))
+        drawn = self.replays[task].sample(count, rng, Returns()).observations
+        return (drawn if isinstance(drawn, Tensor) else torch.from_numpy(drawn)).cpu()
 
     def _decided(self, decision: Stay | SwitchTo) -> SwitchDecided:
         return SwitchDecided(self.steps, self.task, self.visit, self.episodes_in_visit, self.steps_in_visit, decision)

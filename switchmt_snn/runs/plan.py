@@ -21,7 +21,7 @@ import torch
 from switchmt_snn.config import ExperimentConfig, clips_rewards, resolve
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.learning.switching import check_policy
+from switchmt_snn.learning.switching import SwitchingPolicy, check_policy
 from switchmt_snn.machine.devices import has_bfloat16, select_device
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
@@ -83,6 +83,7 @@ def plan(
     with warnings_unless_refused():
         suite = make_suite(config.tasks)
         warnings = check_before_training(config.tasks, suite, clips_rewards(config))
+    SwitchingPolicy(config.switching, len(suite.names), [suite.references.get(name) for name in suite.names])
     if is_plugin(config.network.encoding):
         try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)
     config, notes = decide(config, stored, suite, device, processes)

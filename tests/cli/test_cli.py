@@ -144,6 +144,7 @@ def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path
         "breakout",
     ]
     flags += ["--switching.plateau-window-episodes", "3", "--switching.visit-episodes", "2"]
+    flags += ["--switching.check-every-steps", "60", "--switching.check-episodes", "1"]
     flags += ["--switching.visit-steps", "50", "--switching.max-stay-steps", "200"]
     code, _, err = call(capsys, "train", "quickstart", "--run", str(run), *flags)
     assert code == 0, err
@@ -157,6 +158,10 @@ def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path
         "parameter_change_per_update": ["parameter_change", "updates_in_window"],
         "reward_plateau": ["reward_slope", "reward_t", "flat_episodes"],
         "parameter_and_reward": ["parameter_change", "reward_slope", "parameter_says_leave"],
+        "value_change": ["value_change", "updates_in_window", "value_change_per_update"],
+        "deficit": ["score", "deficit", "share", "owed_steps", "most_owed_steps"],
+        "learning_progress": ["progress", "median_return", "share", "owed_steps"],
+        "plateau_and_return": ["reward_slope", "reward_t", "flat_episodes"],
     }
     assert any(all(row[column] for column in numbers[policy]) for row in rows), rows
 

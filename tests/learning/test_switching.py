@@ -32,6 +32,7 @@ from switchmt_snn.learning.switching import (
 from switchmt_snn.learning.switching.parameter_change import relative_change
 from switchmt_snn.learning.switching.reward_plateau import slope_test
 from switchmt_snn.replay.ring import Returns
+from switchmt_snn.tasks.suite import Reference
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite
 
 
@@ -40,7 +41,11 @@ def record(
 ) -> EpisodeRecord:
     """A record of a visit that began at update 0; default: one update per episode."""
     updates = episode if updates is None else updates
-    return EpisodeRecord(task, episode, steps, updates, updates, value, lambda: theta.clone())
+    observations, values = (lambda count: torch.zeros(count, 4)), (lambda seen: theta.mean().expand(len(seen), 2))
+    return EpisodeRecord(task, episode, steps, updates, updates, value, theta.clone, observations, values)
+
+
+REFERENCES = [Reference(random=0.0, human=1.0, source="made up")] * 3
 
 
 def play(policy: SwitchingPolicy, lengths: list[int], drift: float, values: list[float]) -> list[tuple[int, int, bool]]:
@@ -79,7 +84,7 @@ def test_every_criterion_keeps_the_bounds(policy, lengths, drift, seed, min_step
         max_stay_steps=min_steps + extra,
     )
     values = list(np.random.default_rng(seed).normal(size=len(lengths)))
-    logs = [play(SwitchingPolicy(config, 3), lengths, drift, values) for _ in range(2)]
+    logs = [play(SwitchingPolicy(config, 3, REFERENCES), lengths, drift, values) for _ in range(2)]
     assert logs[0] == logs[1]
     for steps, episodes, left in logs[0]:
         past = steps >= min_steps + extra
@@ -102,7 +107,7 @@ def test_every_criterion_can_leave_and_with_one_task_none_does() -> None:
         # The parameters move fast at first and then hardly, the returns are flat.
         theta, outcomes = torch.ones(4), {1: [], 3: []}
         for num_tasks, decisions in outcomes.items():
-            policy = SwitchingPolicy(config, num_tasks)
+            policy = SwitchingPolicy(config, num_tasks, REFERENCES[:num_tasks])
             theta = torch.ones(4)
             for episode in range(1, 13):
                 theta = theta * (1.5 if episode < 4 else 1.001)
@@ -128,7 +133,14 @@ def test_eq_3_spans_k_episodes() -> None:
     assert "parameter_change" not in fifth.measured, "H_i was emptied"
 
 
-LEARNING_POLICIES = ("parameter_change", "parameter_change_per_update", "reward_plateau", "parameter_and_reward")
+LEARNING_POLICIES = (
+    "parameter_change",
+    "parameter_change_per_update",
+    "reward_plateau",
+    "parameter_and_reward",
+    "value_change",
+    "plateau_and_return",
+)
 
 
 @pytest.mark.parametrize("policy", POLICIES)
@@ -138,14 +150,14 @@ def test_a_policy_that_judges_learning_waits_for_the_first_update_of_the_visit(p
     still = [record(n, 9_000 * n, torch.ones(4), updates=0) for n in range(1, 20)]
     learning = policy in LEARNING_POLICIES
     for judge, waits in (("after_updates", learning), ("auto", learning), ("always", False)):
-        asked = SwitchingPolicy(replace(config, judge_learning=judge), 2)  # type: ignore[arg-type]
+        asked = SwitchingPolicy(replace(config, judge_learning=judge), 2, REFERENCES[:2])  # type: ignore[arg-type]
         answers = [asked.end_of_episode(each) for each in still]
         if waits:
             assert {answer.reason for answer in answers} == {"no_updates_yet"}
             assert all(isinstance(answer, Stay) for answer in answers)
-        elif policy != "parameter_change_per_update":  # it never judged a window without updates
+        elif policy not in ("parameter_change_per_update", "value_change"):  # they judge no window without updates
             assert any(isinstance(answer, SwitchTo) for answer in answers)
-    bounded = SwitchingPolicy(replace(config, max_stay_steps=10_000), 2)
+    bounded = SwitchingPolicy(replace(config, max_stay_steps=10_000), 2, REFERENCES[:2])
     assert isinstance(bounded.end_of_episode(still[1]), SwitchTo), "the bounds hold while it waits"
 
 
@@ -216,8 +228,10 @@ def test_the_config_names_every_criterion_and_no_other() -> None:
 
 @pytest.mark.parametrize("name", sorted(CRITERIA))
 def test_every_criterion_reports_its_columns_and_keeps_no_more_snapshots_than_it_declares(name: str) -> None:
-    config = SwitchingConfig(policy=name, window_episodes=2, plateau_window_episodes=4)
-    policy = SwitchingPolicy(config, 3)
+    config = SwitchingConfig(
+        policy=name, window_episodes=2, plateau_window_episodes=4, check_every_steps=20, check_episodes=2
+    )
+    policy = SwitchingPolicy(config, 3, REFERENCES)
     seen: set[str] = set()
     alive: list[weakref.ref[Tensor]] = []
     most = 0
@@ -229,10 +243,14 @@ def test_every_criterion_reports_its_columns_and_keeps_no_more_snapshots_than_it
         most = max(most, sum(reference() is not None for reference in alive))
         return theta
 
-    for episode in range(1, 20):
-        updates = 0 if episode < 5 else 10 * episode
-        decision = policy.end_of_episode(EpisodeRecord(0, 1, 1, updates, 1, float(episode), parameters))
+    task = in_visit = 0
+    for episode in range(1, 60):
+        updates, in_visit = 0 if episode < 5 else 10 * episode, in_visit + 1
+        made = record(in_visit, 10 * in_visit, torch.rand(4), updates, float(min(episode, 20)), task)
+        decision = policy.end_of_episode(replace(made, updates_in_visit=1, parameters=parameters))
         seen |= set(decision.measured)
+        if isinstance(decision, SwitchTo):
+            task, in_visit = decision.task, 0
     assert seen == set(policy.columns)
     assert most <= policy.criterion.snapshots(config)
     assert not seen & set(DECISION_COLUMNS)

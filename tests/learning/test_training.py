@@ -24,6 +24,7 @@ from switchmt_snn.tasks.play import Play
 from tests.conftest import CountingEnvironment, SameObservationEnvironment, small_config, vector_suite
 from tests.learning.resuming import assert_continues_exactly
 
+REFERENCE = {"reference_scores": [30.0, 60.0]}  # for the policies that need one
 GOLDEN = Path(__file__).parents[1] / "golden" / "update_losses.json"
 
 
@@ -175,18 +176,20 @@ def test_every_attribute_is_saved_or_declared_derived() -> None:
                 walk(item)
 
     for policy in POLICIES:
-        training = counting(small_config(switching={"policy": policy}))
+        training = counting(small_config(switching={"policy": policy, **REFERENCE}))
         run(training)
         walk(training)
     assert {"Training", "Learner", "SwitchingPolicy", "Every", "ParameterChange", "RewardPlateau"} <= seen
-    assert len(seen) == 4 + len(POLICIES)
+    assert len(seen) == 5 + len(POLICIES)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", POLICIES)
 def test_state_dict_continues_exactly(policy: str) -> None:
     """At any step: a new Training with the state of an old one goes on bitwise the same."""
-    config = small_config(switching={"policy": policy, "max_stay_steps": 45}, network={"encoding": "direct"})
+    often = {"visit_steps": 20, "check_every_steps": 30, "check_episodes": 2, "plateau_window_episodes": 3}
+    switching = {"policy": policy, "max_stay_steps": 45, **REFERENCE, **often}
+    config = small_config(switching=switching, network={"encoding": "direct"})
     assert_continues_exactly(lambda: counting(config), at_steps=(3, 33, 150, 271))
 
 

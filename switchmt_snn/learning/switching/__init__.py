@@ -13,19 +13,27 @@ parameter_change               Eq. 3 is below a threshold                       
 parameter_change_per_update    Eq. 3 per gradient step fell to a fraction          parameter_change_per_update.py
 reward_plateau                 the returns no longer rise                          reward_plateau.py
 parameter_and_reward           parameter_change and reward_plateau both leave      parameter_and_reward.py
+value_change                   change of Q per gradient step fell to a fraction    value_change.py
+deficit                        a task farther from its reference is owed steps     deficit.py
+learning_progress              a task whose returns change faster is owed steps    learning_progress.py
+plateau_and_return             the returns no longer rise; back when they fell     plateau_and_return.py
 =============================  ==================================================  =================================
 
 A class from outside the package is named ``package.module:Class`` (docs/extending.md, Switching policy).
 """
 
 from switchmt_snn.learning.switching import (
+    deficit,
     fixed_episodes,
     fixed_steps,
     interleave,
+    learning_progress,
     parameter_and_reward,
     parameter_change,
     parameter_change_per_update,
+    plateau_and_return,
     reward_plateau,
+    value_change,
 )
 from switchmt_snn.learning.switching.bounds import Stay, SwitchingPolicy, SwitchTo
 from switchmt_snn.learning.switching.check import check_policy
@@ -54,14 +62,18 @@ __all__ = [
     "Verdict",
     "check_policy",
     "criterion_class",
+    "deficit",
     "fixed_episodes",
     "fixed_steps",
     "interleave",
+    "learning_progress",
     "make_criterion",
     "parameter_and_reward",
     "parameter_change",
     "parameter_change_per_update",
+    "plateau_and_return",
     "register_criterion",
     "reward_plateau",
+    "value_change",
     "with_policy",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from switchmt_snn.learning.switching.criterion import (
     criterion_code,
     make_criterion,
 )
+from switchmt_snn.tasks.suite import Reference
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class SwitchTo:
 class SwitchingPolicy(Stateful):
     """A criterion within bounds: never leaves before the minimal stay, always by the maximal one.
 
-    The next task is always ``(i + 1) mod |E|``.
+    The next task is ``(i + 1) mod |E|``, unless the criterion chooses another one (``Criterion.next_task``).
 
     Example:
         >>> import torch
@@ -57,15 +59,26 @@ class SwitchingPolicy(Stateful):
     SAVED = ("criterion",)
     DERIVED = ("config", "num_tasks")
 
-    def __init__(self, config: SwitchingConfig, num_tasks: int) -> None:
+    def __init__(
+        self, config: SwitchingConfig, num_tasks: int, references: Sequence[Reference | None] | None = None
+    ) -> None:
         """Make the criterion that the config names.
 
+        Args:
+            config: resolved.
+            num_tasks: number of tasks K.
+            references: published scores of each task; None if no task has any.
+
         Raises:
-            ConfigError: the policy is not resolved, unknown, or no criterion (``make_criterion``).
+            ConfigError: the policy is not resolved, unknown, or no criterion (``make_criterion``), or it lacks what it
+                needs to know of the tasks.
         """
         self.config = config
         self.num_tasks = num_tasks
         self.criterion = make_criterion(config)
+        with criterion_code(config.policy, "meet_tasks"):
+            self.criterion.meet_tasks(num_tasks, tuple(references or [None] * num_tasks))
+        check_state(self.criterion)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -101,7 +114,7 @@ class SwitchingPolicy(Stateful):
     def _judge(self, record: EpisodeRecord) -> Stay | SwitchTo:
         if self._must_wait(record):
             if self.must_leave(record.steps_in_visit):
-                return self.leave(record.task)
+                return self.leave(record.task, record.steps_in_visit)
             return Stay("no_updates_yet", {}, "no update yet")
         if self.criterion.snapshots(self.config) == 0:
             record = replace(record, parameters=self._undeclared_snapshot)
@@ -109,7 +122,7 @@ class SwitchingPolicy(Stateful):
             verdict = self.criterion.end_of_episode(record)
         measured = self._checked(verdict)
         if self.must_leave(record.steps_in_visit):
-            return self._next(record.task, "max_stay_steps", measured)
+            return self._next(record, "max_stay_steps", measured)
         if not verdict.leave:
             return Stay(verdict.reason, measured, verdict.summary)
         if self.num_tasks == 1:
@@ -120,7 +133,7 @@ class SwitchingPolicy(Stateful):
         )
         if too_soon:
             return Stay("min_stay", measured, verdict.summary)
-        return self._next(record.task, verdict.reason, measured)
+        return self._next(record, verdict.reason, measured)
 
     def _must_wait(self, record: EpisodeRecord) -> bool:
         """Whether there is nothing to judge yet: the visit has had no update from the task's own replay."""
@@ -132,9 +145,9 @@ class SwitchingPolicy(Stateful):
         limit = self.config.max_stay_steps
         return limit is not None and self.num_tasks > 1 and steps_in_visit >= limit
 
-    def leave(self, task: int) -> SwitchTo:
+    def leave(self, task: int, steps_in_visit: int) -> SwitchTo:
         """The switch that ``must_leave`` demands within an episode; ``start_visit`` is due after it."""
-        return self._next(task, "max_stay_steps", {})
+        return SwitchTo(self._next_task(task, steps_in_visit), "max_stay_steps", {})
 
     def start_visit(self) -> None:
         """H_i <- []: the criterion forgets the visit that is over."""
@@ -153,9 +166,19 @@ class SwitchingPolicy(Stateful):
             require_storable(value, f"{type(self.criterion).__name__}.{name}")
         return state
 
-    def _next(self, task: int, reason: str, measured: dict[str, float]) -> SwitchTo:
-        """i <- (i + 1) mod |E|."""
-        return SwitchTo((task + 1) % self.num_tasks, reason, measured)
+    def _next(self, record: EpisodeRecord, reason: str, measured: dict[str, float]) -> SwitchTo:
+        return SwitchTo(self._next_task(record.task, record.steps_in_visit), reason, measured)
+
+    def _next_task(self, task: int, steps_in_visit: int) -> int:
+        """i <- (i + 1) mod |E|, or the criterion's choice."""
+        with criterion_code(self.config.policy, "next_task"):
+            chosen: Any = self.criterion.next_task(task, self.num_tasks, steps_in_visit)
+        if type(chosen) is not int or not 0 <= chosen < self.num_tasks or chosen == task:
+            raise ConfigError(
+                f"criterion {type(self.criterion).__name__} returned {shown(chosen)} from next_task, expected the "
+                f"index of another task than {task}, from 0 to {self.num_tasks - 1}"
+            )
+        return chosen
 
     def _checked(self, verdict: Verdict) -> dict[str, float]:
         """The measured numbers, each of which has a column."""

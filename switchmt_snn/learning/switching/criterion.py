@@ -19,6 +19,7 @@ from switchmt_snn.config.plugins import is_plugin, plugin_name, plugin_options, 
 from switchmt_snn.config.registry import Registry
 from switchmt_snn.errors import ConfigError, did_you_mean, shown
 from switchmt_snn.learning.state import Stateful
+from switchmt_snn.tasks.suite import Reference
 
 DECISION_COLUMNS = (
     "step",
@@ -31,6 +32,13 @@ DECISION_COLUMNS = (
     "reason",
 )
 """The columns of switches.csv that every run has; a criterion's own columns follow."""
+
+
+def _no_network(asked: object) -> Tensor:
+    raise ConfigError(
+        "this episode's record has no network to ask for observations or values, expected one of a training; a "
+        "criterion that needs them cannot judge recorded episodes"
+    )
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,10 @@ class EpisodeRecord:
         episode_return: raw return of the episode.
         parameters: returns theta_t as a vector, a copy that stays as it is. Only a criterion that declares
             ``Criterion.snapshots`` may call it.
+        observations: takes a count, and returns so many observations ``[count, ...]`` drawn from the task's replay, to
+            ask ``values`` about. The same step gives the same draw; training's random numbers stay as they are.
+        values: takes observations, and returns their Q-values ``[count, A]`` for the task's actions, by the network
+            that learns, in eval mode.
     """
 
     task: int
@@ -55,6 +67,8 @@ class EpisodeRecord:
     updates_in_visit: int
     episode_return: float
     parameters: Callable[[], Tensor]
+    observations: Callable[[int], Tensor] = _no_network
+    values: Callable[[Tensor], Tensor] = _no_network
 
 
 @dataclass(frozen=True)
@@ -112,6 +126,27 @@ class Criterion(Stateful):
     def snapshots(cls, config: SwitchingConfig) -> int:
         """The largest number of parameter vectors that it holds at a time, for the memory estimate. Default: 0."""
         return 0
+
+    def meet_tasks(self, num_tasks: int, references: tuple[Reference | None, ...]) -> None:
+        """Learn how many tasks there are, and their published scores; called once, after the constructor.
+
+        What it sets belongs into ``SAVED`` or ``DERIVED``, too. Default: nothing.
+        """
+
+    def next_task(self, task: int, num_tasks: int, steps_in_visit: int) -> int:
+        """The task that follows when a visit ends, also when ``max_stay_steps`` ends it. Default: the next in order.
+
+        Called once per visit, before ``start_visit`` and before the rest of the episodes that ended in the same step.
+
+        Args:
+            task: the task that is left.
+            num_tasks: number of tasks K, at least 2.
+            steps_in_visit: agent steps of the visit, those after its last episode end included.
+
+        Returns:
+            an index below K, other than ``task``.
+        """
+        return (task + 1) % num_tasks
 
     def start_visit(self) -> None:
         """Forget the last visit (Algorithm 1: H_i <- []). Default: nothing to forget."""
