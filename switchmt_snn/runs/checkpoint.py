@@ -14,6 +14,7 @@ removed only after that. Frames of a full replay segment are written once, howev
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,11 +29,10 @@ import torch
 import zstandard
 
 from switchmt_snn.errors import CheckpointError, require_saved
-from switchmt_snn.replay.ring import FrameReplay, Segment
+from switchmt_snn.replay.ring import SEGMENT_SLOTS, FrameReplay, Segment
 from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
+from switchmt_snn.runs.manifest import FORMAT, read_json, read_manifest, seal
 
-FORMAT = 4
-"""Goes up when a saved state gets another shape. 2: paused episodes of every task. 4: model.safetensors may be Q*."""
 _CONTINUED = 3
 """The oldest format that can be continued. Weights are read from any."""
 _STEP_DIGITS = 12
@@ -177,7 +177,7 @@ class CheckpointStore:
     def best(self) -> Best | None:
         """What is known of the best weights; None if there are none."""
         try:
-            manifest = _read_manifest(self.folder / "best")
+            manifest = read_manifest(self.folder / "best")
         except CheckpointError:
             return None
         return Best(int(manifest["step"]), float(manifest["score"]), manifest.get("judged_by", "returns"))
@@ -187,7 +187,7 @@ class CheckpointStore:
             write_atomically(folder / name, content)
         sums = {name: sha256(content) for name, content in files.items()}
         manifest = {"format": FORMAT, "program": "switchmt-snn", **facts, "files": sums}
-        sealed = {**manifest, "seal": _seal(manifest)}
+        sealed = {**manifest, "seal": seal(manifest)}
         write_atomically(folder / "manifest.json", json.dumps(sealed, indent=1).encode())
 
     def _store_segments(self, task: int, replay: FrameReplay) -> Iterator[dict[str, Any]]:
@@ -213,7 +213,7 @@ class CheckpointStore:
         used = set()
         for path in self.paths():
             try:
-                used |= {entry["sha256"] for entry in _read_manifest(path)["segments"]}
+                used |= {entry["sha256"] for entry in read_manifest(path)["segments"]}
             except CheckpointError:
                 return  # a damaged manifest: its segments are unknown, so none is removed
         for path in [*self._replay_folder.glob("*.zst"), *self._replay_folder.glob(".*.tmp")]:
@@ -250,7 +250,7 @@ class CheckpointStore:
         raise CheckpointError(f"no checkpoint in {self.folder}, expected one; run switchmt-snn train first")
 
     def _load_one(self, path: Path, replays: list[FrameReplay], damaged: tuple[str, ...]) -> LoadedCheckpoint:
-        manifest = _read_manifest(path)
+        manifest = read_manifest(path)
         if manifest["format"] < _CONTINUED:
             raise CheckpointError(
                 f"format {manifest['format']} can be evaluated, but only {_CONTINUED} and later can be continued"
@@ -262,11 +262,13 @@ class CheckpointStore:
             )
         model = _read_tensors(path, _MODEL_FILE, manifest)
         training = _read_tensors(path, "training.safetensors", manifest)
-        tree = _read_json(_read_file(path, "state.json", manifest), "state.json")
+        tree = read_json(_read_file(path, "state.json", manifest), "state.json")
         state = _join(tree, model, training, _MODEL_PREFIXES[manifest.get("acting_network", "online")])
         contents = [self._read_segment(entry) for entry in manifest["segments"]]
         require_saved(state, ("replays",), "the run")
         require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
+        for entry, content in zip(manifest["segments"], contents, strict=True):
+            _require_segment(content, entry, replays)
         # Nothing is changed before everything was read.
         for task, replay in enumerate(replays):
             replay.load_state_dict(state["replays"][str(task)])
@@ -283,7 +285,7 @@ class CheckpointStore:
     def _is_whole(self, path: Path) -> bool:
         """Whether a checkpoint and the segments it refers to can be read as they were written."""
         try:
-            manifest = _read_manifest(path)
+            manifest = read_manifest(path)
             for name in manifest["files"]:
                 _read_file(path, name, manifest)
             for entry in manifest["segments"]:
@@ -313,7 +315,7 @@ class CheckpointStore:
         damaged: list[str] = []
         for path in [self.folder / "best"] if which == "best" else self.paths():
             try:
-                manifest = _read_manifest(path)
+                manifest = read_manifest(path)
                 return int(manifest["step"]), _read_tensors(path, _MODEL_FILE, manifest), tuple(damaged)
             except CheckpointError as error:
                 damaged.append(f"checkpoint {path.name} is damaged ({error})")
@@ -324,32 +326,6 @@ class CheckpointStore:
 
 def _name(step: int) -> str:
     return f"step-{step:0{_STEP_DIGITS}d}"
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = _read_json((path / "manifest.json").read_bytes(), "manifest.json")
-    except OSError as error:
-        raise CheckpointError("manifest.json cannot be read") from error
-    if not isinstance(manifest, dict) or not isinstance(manifest.get("format"), int):
-        raise CheckpointError("manifest.json is not a manifest")
-    if manifest["format"] > FORMAT:
-        raise CheckpointError(f"format {manifest['format']} is newer than {FORMAT}; update switchmt-snn")
-    if manifest.pop("seal", None) != _seal(manifest):
-        raise CheckpointError("manifest.json has another checksum")
-    return manifest
-
-
-def _seal(manifest: dict[str, Any]) -> str:
-    """Checksum of a manifest's own content."""
-    return sha256(json.dumps(manifest, sort_keys=True).encode())
-
-
-def _read_json(content: bytes, name: str) -> Any:
-    try:
-        return json.loads(content)
-    except ValueError as error:
-        raise CheckpointError(f"{name} is not JSON") from error
 
 
 def _read_file(path: Path, name: str, manifest: dict[str, Any]) -> bytes:
@@ -366,9 +342,28 @@ def _read_tensors(path: Path, name: str, manifest: dict[str, Any]) -> dict[str, 
     content = _read_file(path, name, manifest)
     try:
         tensors: dict[str, torch.Tensor] = safetensors.torch.load(content)
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{name} is not a safetensors file") from error
+    if name == _MODEL_FILE:
+        for key, tensor in tensors.items():
+            if not bool(torch.isfinite(tensor.to(torch.float32)).all()):  # wider numbers would not fit a weight
+                raise CheckpointError(f"{key} in {name} has a number that is not finite, expected finite weights")
     return tensors
+
+
+def _require_segment(content: bytes, entry: dict[str, Any], replays: list[FrameReplay]) -> None:
+    """Refuse a stored segment that no replay of the run has, or that declares more than a segment's size."""
+    number = f"replay segment {entry['sha256'][:12]}"
+    if entry["task"] >= len(replays) or entry["lane"] >= replays[entry["task"]].num_lanes:
+        raise CheckpointError(f"{number} is of task {entry['task']} and copy {entry['lane']}, which the run has not")
+    replay = replays[entry["task"]]
+    frame_bytes = math.prod(replay.frame_shape) * replay.frame_dtype.itemsize
+    try:
+        size = zstandard.frame_content_size(content)
+    except zstandard.ZstdError as error:
+        raise CheckpointError(f"{number} is not Zstandard") from error
+    if not 0 <= size <= SEGMENT_SLOTS * frame_bytes or size % frame_bytes:
+        raise CheckpointError(f"{number} declares {size:,} bytes, expected at most {SEGMENT_SLOTS:,} whole frames")
 
 
 # A nested state <-> tensors by path and a JSON tree in which {"$tensor": path} stands for a tensor.

@@ -5,6 +5,8 @@ A reader takes a mutant or refuses it by one printable line (``SwitchMTError``),
 
 from __future__ import annotations
 
+import functools
+import json
 import resource
 import signal
 import warnings
@@ -17,12 +19,16 @@ from switchmt_snn.config import TasksConfig, load_config, resolve, to_yaml
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.export.selection import Selection
+from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.runs.checkpoint import CheckpointStore, fitting_weights
 from switchmt_snn.runs.description import describe_method
-from switchmt_snn.runs.files import file_name
+from switchmt_snn.runs.files import file_name, sha256
+from switchmt_snn.runs.manifest import seal
+from switchmt_snn.spiking.network import QNetwork, build_network
 from switchmt_snn.study.grid import load_study
 from switchmt_snn.tasks.registry import make_suite
 from tests.export.chip_networks import chain
-from tests.fuzz.mutations import mutant, text_mutant
+from tests.fuzz.mutations import binary_mutant, json_mutant, mutant, text_mutant
 
 ROOT = Path(__file__).parents[2]
 MOST_CPU_S = 10.0
@@ -154,11 +160,59 @@ references: {CartPole-v1: 500, Acrobot-v1: -100.5}
 baseline: both_policy-interleave_learning_rate-1e-4
 """
 """A study with every key."""
+CHECKPOINTS = {
+    path.parent.parent.parent.name: path.parent
+    for path in sorted(ROOT.glob("tests/fixtures/runs/*/checkpoints/step-*/manifest.json"))
+}
+"""A checkpoint of each stored run."""
+
+
+@functools.cache
+def _network() -> QNetwork:
+    """The network of the stored run whose weights are fuzzed."""
+    config = resolve(load_config(ROOT / "tests/fixtures/runs/gym/config.yaml"))
+    return build_network(config.network, observation_spec(make_suite(config.tasks)), config.seed)
+
+
+def _read_checkpoint(folder: Path, manifest: bytes, weights: bytes) -> None:
+    """Read the weights of a checkpoint as ``load_agent`` does."""
+    checkpoint = folder / "step-000000000400"
+    checkpoint.mkdir(exist_ok=True)
+    (checkpoint / "manifest.json").write_bytes(manifest)
+    (checkpoint / "model.safetensors").write_bytes(weights)
+    step, state, _ = CheckpointStore(folder).load_model()
+    assert step >= 0
+    with fitting_weights():
+        _network().load_state_dict(state)
+    assert all(bool(tensor.isfinite().all()) for tensor in _network().state_dict().values())
+
+
+def _read_manifest(folder: Path, content: bytes, number: int) -> None:
+    """A manifest whose seal was made to fit, beside good weights."""
+    try:
+        data = json.loads(content)
+        if isinstance(data, dict):
+            data.pop("seal", None)
+            content = json.dumps({**data, "seal": seal(data)}).encode()
+    except (ValueError, RecursionError):
+        pass
+    _read_checkpoint(folder, content, (CHECKPOINTS["gym"] / "model.safetensors").read_bytes())
+
+
+def _read_weights(folder: Path, content: bytes, number: int) -> None:
+    """Weights whose checksums were made to fit."""
+    manifest = json.loads((CHECKPOINTS["gym"] / "manifest.json").read_bytes())
+    del manifest["seal"]
+    manifest["files"]["model.safetensors"] = sha256(content)
+    _read_checkpoint(folder, json.dumps({**manifest, "seal": seal(manifest)}).encode(), content)
+
 
 FORMATS = {
     "config": Format(_files("configs/*.yaml", "tests/fixtures/runs/*/config.yaml", "examples/*.yaml"), _read_config),
     "study": Format({**_files("configs/studies/*.yaml"), "grid": GRID}, _read_study),
     "target": Format(_files("export/energy/targets/*.yaml", "export/chips/builtin/*.yaml"), _read_target),
+    "manifest": Format({"gym": (CHECKPOINTS["gym"] / "manifest.json").read_bytes()}, _read_manifest, json_mutant),
+    "weights": Format({"gym": (CHECKPOINTS["gym"] / "model.safetensors").read_bytes()}, _read_weights, binary_mutant),
     "task-id": Format({name: name.encode() for name in TASK_IDS}, _read_task_id, _task_id_mutant),
 }
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import random
+import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +56,38 @@ def text_mutant(good: str, seed: int) -> str:
             other = rng.randrange(len(letters))
             letters[place - 1], letters[other] = letters[other], letters[place - 1]
     return "".join(letters)
+
+
+def json_mutant(good: bytes, seed: int) -> bytes:
+    """A mutant of a good JSON file: of its content, or one time in four of its bytes."""
+    rng = random.Random(seed)
+    if rng.random() < 0.25:
+        return rng.choice((_flip, _delete, _repeat, _truncate, _insert, _encode))(good, rng)
+    data = json.loads(good)
+    for _ in range(rng.choice((1, 1, 2))):
+        _change_node(data, rng)
+    return json.dumps(data).encode()
+
+
+def binary_mutant(good: bytes, seed: int) -> bytes:
+    """A mutant of a good binary file: one to three changes of its bytes."""
+    rng = random.Random(seed)
+    content = good
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        content = rng.choice((_flip, _flip, _delete, _repeat, _truncate, _insert, _poke, _poke))(content, rng)
+    return content
+
+
+def _poke(content: bytes, rng: random.Random) -> bytes:
+    """Write a number over the content: at its start, where sizes are, or at a place where a weight may be."""
+    number = rng.choice(
+        (
+            struct.pack("<Q", rng.choice((0, 1, 2**31, 2**40, 2**63))),
+            struct.pack("<f", rng.choice((float("nan"), float("inf")))),
+        )
+    )
+    place = 0 if rng.random() < 0.3 else rng.randrange(len(content) + 1) // 4 * 4
+    return content[:place] + number + content[place + len(number) :]
 
 
 def _flip(content: bytes, rng: random.Random) -> bytes:
@@ -109,19 +143,26 @@ def _change_content(content: bytes, rng: random.Random) -> bytes:
         data = yaml.safe_load(content)
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, KeyError, RecursionError):
         return _flip(content, rng)
+    if not _change_node(data, rng):
+        return _insert(content, rng)
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=rng.random() < 0.5).encode("utf-8", "replace")
+
+
+def _change_node(data: Any, rng: random.Random) -> bool:
+    """Change one value or one key somewhere in lists and mappings; False if there is none."""
     node, parents = data, []
     while isinstance(node, (dict, list)) and node and (not parents or rng.random() < 0.8):
         key = rng.choice(list(node)) if isinstance(node, dict) else rng.randrange(len(node))
         parents.append((node, key))
         node = node[key]
     if not parents:
-        return _insert(content, rng)
+        return False
     parent, key = parents[-1]
     if rng.random() < 0.15 and isinstance(parent, dict):
         parent[rng.choice(("unknown", 1, None, "\x1b[31m", "x" * 300, 1.5, True))] = parent.pop(key)
     else:
         parent[key] = rng.choice(HOSTILE_VALUES)
-    return yaml.safe_dump(data, sort_keys=False, allow_unicode=rng.random() < 0.5).encode("utf-8", "replace")
+    return True
 
 
 _CHANGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (

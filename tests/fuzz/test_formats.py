@@ -19,7 +19,7 @@ from tests.fuzz.run import campaign
 CORPUS = Path(__file__).parent / "corpus"
 EXPECTED: dict[str, dict[str, str]] = json.loads((CORPUS / "expected.json").read_text())
 """By format and file: how the line of its refusal begins, or ``taken``."""
-BUDGET = {"config": 150, "study": 40, "target": 100, "task-id": 200}
+BUDGET = {"config": 150, "study": 40, "target": 100, "task-id": 200, "manifest": 200, "weights": 200}
 
 
 @pytest.mark.parametrize("name", FORMATS)
