@@ -39,6 +39,16 @@ weights, scores **15.3 ± 0.7** (30 episodes, the same protocol; a human: 14.6):
 exports take it now.
 At 100,000 steps statistics were fresh.
 """,
+    "three-half-s1": """\
+Three games in one network: `strong` with the preset `pong`'s channels and 16 samples per agent step (n_steps 10,
+batches of 32). One seed, stopped after 141,432 of 1,000,000 steps for lack of machine time. It was continued once,
+after 100,000 steps, by a newer version, which evaluates the network that acts; both evaluations below are of that
+network, the first of 10 episodes.
+**Pong is being learned, step for step of its own as in the network that learns Pong alone (pong-s1); Breakout was
+above the paper's 5.6 once and did not stay there; Enduro is not learned.** Random play meets no reward in Enduro: not
+one in the first 50,632 stored transitions. Holding the accelerator would, and `learning.longest_random_action_steps:
+100` finds some (16 in 5,200 steps of random play). No run has trained with it yet.
+""",
 }
 """What a reader must know of a run."""
 
