@@ -22,6 +22,15 @@ from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.runs.run import load_agent, train
 from switchmt_snn.study.grid import load_study
+from switchmt_snn.study.statistics import (
+    area_under_curve,
+    forgetting,
+    harmonic_mean_over_tasks,
+    holm,
+    interquartile_mean,
+    probability_of_improvement,
+    sign_flip_test,
+)
 from switchmt_snn.study.timing import makespan
 from switchmt_snn.tasks.gym_make import make_environment
 from switchmt_snn.tasks.report import check_env
@@ -40,6 +49,13 @@ EXAMPLES: tuple[Any, ...] = (
     thinned,
     write_report,
     load_study,
+    interquartile_mean,
+    probability_of_improvement,
+    harmonic_mean_over_tasks,
+    area_under_curve,
+    forgetting,
+    sign_flip_test,
+    holm,
     makespan,
     file_name,
     json_text,
