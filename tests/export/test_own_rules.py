@@ -146,7 +146,7 @@ def test_an_encoding_without_an_onnx_rule_is_profiled_and_exported_to_nir(
     assert "What rounded weights do to the actions is left out" in (run / "profile" / "report.html").read_text()
     out, _ = run_command("export", run, "--parity-decisions", 20)
     assert "left out ONNX: ONNX has no rule for network.encoding my_encodings:Thermometer" in out
-    assert {path.suffix for path in (run / "export").iterdir()} == {".nir", ".json"}
+    assert {path.suffix for path in (run / "export").iterdir()} == {".nir", ".json", ".md"}
     assert list(json.loads((run / "export" / "parity.json").read_text())["left_out"]) == ["onnx"]
     _, err = run_command("export", run, "--onnx", code=2)
     assert "ONNX has no rule" in err

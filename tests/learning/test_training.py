@@ -179,8 +179,9 @@ def test_every_attribute_is_saved_or_declared_derived() -> None:
         training = counting(small_config(switching={"policy": policy, **REFERENCE}))
         run(training)
         walk(training)
-    assert {"Training", "Learner", "SwitchingPolicy", "Every", "ParameterChange", "RewardPlateau"} <= seen
-    assert len(seen) == 5 + len(POLICIES)
+    parts = {"Training", "Learner", "SwitchingPolicy", "Exploration", "Every", "ParameterChange", "RewardPlateau"}
+    assert parts <= seen
+    assert len(seen) == 6 + len(POLICIES)
 
 
 @pytest.mark.slow

@@ -79,7 +79,8 @@ def test_own_environments_are_evaluated_and_exported_under_names_that_differ(env
     assert (run / "evaluations" / name).is_file()
     command(environments, "export", "run", "--onnx", "--nir", "--task", ENVS[0], "--parity-decisions", "40")
     written = {path.name for path in (run / "export").iterdir()}
-    assert written == {"decision.onnx", "step.onnx", f"decision_{file_name(ENVS[0])}.onnx", "parity.json"} | {
+    own = f"decision_{file_name(ENVS[0])}.onnx"
+    assert written == {"decision.onnx", "step.onnx", own, "parity.json", "MODEL_CARD.md"} | {
         f"{file_name(task)}.{suffix}" for task in ENVS for suffix in ("nir", "json")
     }
     for runtime in ("onnx", "nir"):
