@@ -201,18 +201,7 @@ class RunFolder:
         Raises:
             RunFolderError: another process has it, or the folder cannot be written.
         """
-        lock = filelock.FileLock(self.path / "run.lock")
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock.acquire(timeout=LOCK_TIMEOUT_S)
-        except filelock.Timeout as error:
-            raise RunFolderError(
-                f"{self.path} is in use by another process, expected a free run folder; wait for it, or name another "
-                "one with --run"
-            ) from error
-        except OSError as error:
-            raise RunFolderError(unwritable(self.path, error)) from error
-        return lock
+        return locked(self.path, "run")
 
     @property
     def in_use(self) -> bool:
@@ -246,9 +235,35 @@ class RunFolder:
         return {task: (values[:episodes], values[-episodes:]) for task, values in by_task.items()}
 
 
-def unwritable(path: Path, error: OSError) -> str:
-    """The line for a folder that the system does not let be written."""
-    return f"{path} cannot be written ({error.strerror or error}), expected a writable folder; name another with --run"
+def locked(folder: Path, what: str, option: str = "--run") -> filelock.BaseFileLock:
+    """Take a folder for this process, by the lock ``WHAT.lock`` in it.
+
+    Args:
+        folder: made if it is not there.
+        what: lives in it: ``run`` or ``study``.
+        option: by which a user names another one.
+
+    Raises:
+        RunFolderError: another process has it, or the folder cannot be written.
+    """
+    lock = filelock.FileLock(folder / f"{what}.lock")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=LOCK_TIMEOUT_S)
+    except filelock.Timeout as error:
+        raise RunFolderError(
+            f"{folder} is in use by another process, expected a free {what} folder; wait for it, or name another "
+            f"one with {option}"
+        ) from error
+    except OSError as error:
+        raise RunFolderError(unwritable(folder, error, option)) from error
+    return lock
+
+
+def unwritable(path: Path, error: OSError, option: str = "--run") -> str:
+    """The line for a folder that the system does not let be written; ``option`` names another one."""
+    reason = error.strerror or error
+    return f"{path} cannot be written ({reason}), expected a writable folder; name another with {option}"
 
 
 def check_same_config(stored: ExperimentConfig, asked: ExperimentConfig, path: Path) -> None:

@@ -101,7 +101,7 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
             write_atomically(packed.path / CARD, model_card(packed).encode())
             packed.path.rename(out)
     except OSError as error:
-        raise RunFolderError(unwritable(out, error)) from error
+        raise RunFolderError(unwritable(out, error, "--out")) from error
     return out
 
 

@@ -18,7 +18,7 @@ import filelock
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError, SwitchMTError
 from switchmt_snn.runs.files import json_text, write_atomically
-from switchmt_snn.runs.folder import RunFolder, unwritable
+from switchmt_snn.runs.folder import RunFolder, locked, unwritable
 from switchmt_snn.study.grid import Study, Trial
 
 STUDIES = Path("runs") / "studies"
@@ -120,7 +120,7 @@ class StudyFolder:
                     write_atomically(self.config(trial), text)
             write_atomically(self.path / "trials.json", json_text(_listed(study), indent=1).encode())
         except OSError as error:
-            raise RunFolderError(unwritable(self.path, error).replace("--run", "--folder")) from error
+            raise RunFolderError(unwritable(self.path, error, "--folder")) from error
 
     def _require_same(self, study: Study) -> None:
         known = {trial.name: trial for trial in study.trials}
@@ -168,18 +168,7 @@ class StudyFolder:
         Raises:
             RunFolderError: another process has it, or the folder cannot be written.
         """
-        lock = filelock.FileLock(self.path / "study.lock")
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock.acquire(timeout=0.5)
-        except filelock.Timeout as error:
-            raise RunFolderError(
-                f"{self.path} is in use by another process, expected a free study; wait for it, or name another "
-                "folder with --folder"
-            ) from error
-        except OSError as error:
-            raise RunFolderError(unwritable(self.path, error).replace("--run", "--folder")) from error
-        return lock
+        return locked(self.path, "study", "--folder")
 
     def note_attempt(self, attempt: Attempt) -> None:
         """Append a line to attempts.jsonl."""
