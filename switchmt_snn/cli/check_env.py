@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -28,6 +29,8 @@ class CheckEnvOptions:
     """As tasks.image_layout."""
     steps: int = 1000
     """Steps of random play."""
+    seconds: float = 30.0
+    """About how long the check of one environment may take: half of it for the random play, half for playing again."""
     json: bool = False
     """Print the facts as JSON."""
 
@@ -40,12 +43,16 @@ def command(argv: list[str]) -> int:
         raise ConfigError("check-env was given no environment, expected one: switchmt-snn check-env CartPole-v1")
     if not 1 <= options.steps <= MOST_STEPS:
         raise ConfigError(f"--steps is {options.steps}, expected 1 to {MOST_STEPS:,}")
+    if not options.seconds > 0:
+        raise ConfigError(f"--seconds is {options.seconds:g}, expected more than 0")
     from switchmt_snn.tasks.report import check_env
 
     reports = check_env(
         *names,
         suite=options.suite,
         steps=options.steps,
+        seconds=options.seconds,
+        say=_say,
         wrappers=options.wrappers,
         image_layout=options.image_layout,
     )
@@ -55,6 +62,10 @@ def command(argv: list[str]) -> int:
     for report in reports:
         print("\n".join(_lines(report)))
     return 0
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _lines(report: EnvironmentReport) -> list[str]:
@@ -67,6 +78,8 @@ def _lines(report: EnvironmentReport) -> list[str]:
     low, high = report.observed
     count = len(report.episode_lengths)
     ended = f"{count} ended in {report.steps:,} steps of random play"
+    if report.ended_by_limit_s is not None:
+        ended += f" (ended by its limit of {report.ended_by_limit_s:g} s; --seconds raises it)"
     if count:
         lengths, returns = report.episode_lengths, report.episode_returns
         ended += (
@@ -85,7 +98,8 @@ def _lines(report: EnvironmentReport) -> list[str]:
         "rewards": f"from {report.rewards[0]:g} to {report.rewards[1]:g}",
         "episodes": ended,
         "limit": None if report.limit_steps is None else f"{report.limit_steps:,} steps",
-        "same seed": f"plays the same again: {yes[report.repeats]}; after other episodes: {yes[report.starts_afresh]}",
+        "same seed": f"plays the same {report.compared_steps:,} steps again: {yes[report.repeats]}; "
+        f"after other episodes: {yes[report.starts_afresh]}",
         "other seed": f"plays something else: {yes[report.seeds_differ]}",
         "threads": f"evaluations use {threads}; the same in several: {yes[report.same_in_threads]}",
         "speed": f"{report.steps_per_s:,.0f} steps/s, one copy",

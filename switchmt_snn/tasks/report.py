@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -26,6 +27,13 @@ COMPARED_STEPS = 200
 """Steps that are played again to compare them."""
 THREADS = 4
 """Threads that play at a time for the check of thread safety."""
+LONGEST_S = 30.0
+"""Default limit of a task's check: half of it for the random play, the other half for playing again."""
+SAID_EVERY_S = 5.0
+SLOW_STEPS_PER_S = 200
+"""A slower environment takes longer than its training does."""
+PLAYS_AGAIN = 2 * (4 + THREADS)
+"""Plays of as many steps as are compared: of two copies, alone and in threads, and the starts of episodes."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +50,9 @@ class EnvironmentReport:
         scale: factor to the network's input.
         observed: smallest and largest raw value.
         actions: by the environment's own numbers.
-        steps: that were played.
+        steps: of the random play, that were really played.
+        ended_by_limit_s: the limit of time that ended the random play before its steps; None if none did.
+        compared_steps: that were played again for ``repeats``, ``seeds_differ`` and ``same_in_threads``.
         episode_lengths: of episodes that ended.
         episode_returns: likewise.
         truncated: how many of them were truncated.
@@ -68,6 +78,8 @@ class EnvironmentReport:
     observed: tuple[float, float]
     actions: tuple[int, ...]
     steps: int
+    ended_by_limit_s: float | None
+    compared_steps: int
     episode_lengths: tuple[int, ...]
     episode_returns: tuple[float, ...]
     truncated: int
@@ -87,8 +99,30 @@ class EnvironmentReport:
         return asdict(self)
 
 
+def _nothing(_text: str) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """How a task is to be played; see ``check_env``."""
+
+    steps: int
+    seconds: float
+    seed: int
+    say: Callable[[str], None]
+    clock: Callable[[], float]
+
+
 def check_env(
-    *names: str, suite: str = "gym", steps: int = 1000, seed: int = 0, **settings: Any
+    *names: str,
+    suite: str = "gym",
+    steps: int = 1000,
+    seconds: float = LONGEST_S,
+    seed: int = 0,
+    say: Callable[[str], None] = _nothing,
+    clock: Callable[[], float] = time.perf_counter,
+    **settings: Any,
 ) -> tuple[EnvironmentReport, ...]:
     """What tasks are taken for, and how they play; in the manner of Gymnasium's checker, whose warnings are notes here.
 
@@ -96,7 +130,11 @@ def check_env(
         names: of the tasks; together they must fit one network.
         suite: value of ``tasks.suite``.
         steps: of random play, with one copy of each task.
+        seconds: about how long the check of one task may take. Half of it is the limit of the random play, which stops
+            there; as many steps are played again as fit the other half (at least one, at most 200).
         seed: of episodes and random actions.
+        say: is told in plain lines what is being done.
+        clock: the time in seconds, from any start.
         settings: other fields of ``TasksConfig`` (``wrappers``, ``image_layout``, ...).
 
     Raises:
@@ -112,7 +150,8 @@ def check_env(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         tasks = make_suite(config)
-        reports = [_report(config, tasks, task, steps, seed) for task in range(len(names))]
+        asked = _Asked(steps, seconds, seed, say, clock)
+        reports = [_report(config, tasks, task, asked) for task in range(len(names))]
     # A DeprecationWarning is for a library's authors; Python, too, hides it from those who run the library.
     told = (warning for warning in caught if not issubclass(warning.category, DeprecationWarning))
     heard = tuple(dict.fromkeys(_plain(str(warning.message)) for warning in told))
@@ -121,15 +160,22 @@ def check_env(
     return tuple(reports)
 
 
-def _report(config: TasksConfig, tasks: TaskSuite, task: int, steps: int, seed: int) -> EnvironmentReport:
+def _report(config: TasksConfig, tasks: TaskSuite, task: int, asked: _Asked) -> EnvironmentReport:
+    seed = asked.seed
     made: list[TaskEnvironment] = []
 
     def make(number: int, num_envs: int) -> TaskEnvironment:
         made.append(tasks.make(number, num_envs))
         return made[-1]
 
-    played = _Played(replace(tasks, make=make), task, steps, seed)
-    compared = min(steps, COMPARED_STEPS)
+    played = _Played(replace(tasks, make=make), task, asked)
+    fitting = asked.seconds / 2 * played.steps_per_s / PLAYS_AGAIN
+    compared = max(1, int(min(asked.steps, COMPARED_STEPS, fitting)))
+    asked.say(
+        f"{tasks.names[task]}: plays {compared:,} steps again, with the same seed, with another one, and in {THREADS} "
+        "threads"
+    )
+    played.compare_start(tasks, compared)
     first = journal(tasks, task, compared, seed)
     facts = _gym_facts(config, task)
     actions = np.flatnonzero(tasks.valid_actions_KA[task]) + tasks.first_action(task)
@@ -143,7 +189,9 @@ def _report(config: TasksConfig, tasks: TaskSuite, task: int, steps: int, seed: 
         scale=tasks.scale,
         observed=(played.low, played.high),
         actions=tuple(actions.tolist()),
-        steps=steps,
+        steps=len(played.rewards),
+        ended_by_limit_s=asked.seconds / 2 if len(played.rewards) < asked.steps else None,
+        compared_steps=compared,
         episode_lengths=tuple(played.lengths),
         episode_returns=tuple(played.returns),
         truncated=played.truncated,
@@ -161,46 +209,66 @@ def _report(config: TasksConfig, tasks: TaskSuite, task: int, steps: int, seed: 
 
 
 class _Played:
-    """A random play of one copy."""
+    """A random play of one copy, until its steps or its time are over."""
 
-    def __init__(self, tasks: TaskSuite, task: int, steps: int, seed: int) -> None:
-        rng, valid = np.random.default_rng(seed), np.flatnonzero(tasks.valid_actions_KA[task])
+    def __init__(self, tasks: TaskSuite, task: int, asked: _Asked) -> None:
+        self._task, self._seed, self._valid = task, asked.seed, np.flatnonzero(tasks.valid_actions_KA[task])
         self.lengths: list[int] = []
         self.returns: list[float] = []
         self.rewards: list[float] = []
-        self.truncated, episodes, one = 0, 1, np.zeros(1, np.int64)
-        play = Play(tasks, task, 1)
+        self.truncated = 0
+        self._play = Play(tasks, task, 1)
         try:
-            frames = play.begin(one, np.asarray([episode_seed(seed, task, 0)]))
-            self.low, self.high = float(frames.min()), float(frames.max())
-            started = time.perf_counter()
-            for _ in range(steps):
-                result = play.step(rng.choice(valid, 1))
-                self.low = min(self.low, float(result.frames.min()))
-                self.high = max(self.high, float(result.frames.max()))
-                self.rewards.append(float(result.rewards[0]))
-                if len(result.ended):
-                    self.lengths.append(int(play.lengths_steps[0]))
-                    self.returns.append(float(play.returns[0]))
-                    self.truncated += bool(result.truncated[0]) and not bool(result.terminated[0])
-                    play.begin(one, np.asarray([episode_seed(seed, task, episodes)]))
-                    episodes += 1
-            self.steps_per_s = steps / (time.perf_counter() - started)
-            again = _one_episode(play, valid, seed)
+            self._play_at_random(tasks.names[task], asked)
+        except BaseException:
+            self._play.close()
+            raise
+
+    def _play_at_random(self, name: str, asked: _Asked) -> None:
+        rng, one, episodes, play = np.random.default_rng(asked.seed), np.zeros(1, np.int64), 1, self._play
+        limit_s = asked.seconds / 2
+        asked.say(f"{name}: random play of {asked.steps:,} steps, for {limit_s:g} s at the most")
+        frames = play.begin(one, np.asarray([episode_seed(asked.seed, self._task, 0)]))
+        self.low, self.high = float(frames.min()), float(frames.max())
+        started = asked.clock()
+        said = 0.0
+        for step in range(1, asked.steps + 1):
+            result = play.step(rng.choice(self._valid, 1))
+            self.low = min(self.low, float(result.frames.min()))
+            self.high = max(self.high, float(result.frames.max()))
+            self.rewards.append(float(result.rewards[0]))
+            if len(result.ended):
+                self.lengths.append(int(play.lengths_steps[0]))
+                self.returns.append(float(play.returns[0]))
+                self.truncated += bool(result.truncated[0]) and not bool(result.terminated[0])
+                play.begin(one, np.asarray([episode_seed(asked.seed, self._task, episodes)]))
+                episodes += 1
+            elapsed = asked.clock() - started
+            if elapsed >= limit_s:
+                break
+            if elapsed - said >= SAID_EVERY_S:
+                said = elapsed
+                asked.say(f"{name}: {step:,} of {asked.steps:,} steps in {elapsed:.0f} s")
+        self.steps_per_s = len(self.rewards) / max(asked.clock() - started, 1e-9)
+
+    def compare_start(self, tasks: TaskSuite, steps: int) -> None:
+        """Whether an episode's first steps, after those played, are as in an environment made anew; closes the play."""
+        try:
+            again = _one_episode(self._play, self._valid, self._seed, steps)
         finally:
-            play.close()
-        anew = Play(tasks, task, 1)
+            self._play.close()
+        anew = Play(tasks, self._task, 1)
         try:
-            self.starts_afresh = differs_from(again, _one_episode(anew, valid, seed)) is None
+            self.starts_afresh = differs_from(again, _one_episode(anew, self._valid, self._seed, steps)) is None
         finally:
             anew.close()
 
 
-def _one_episode(play: Play, valid: npt.NDArray[np.int64], seed: int) -> list[tuple[npt.NDArray[Any], ...]]:
+def _one_episode(play: Play, valid: npt.NDArray[np.int64], seed: int, steps: int) -> list[tuple[npt.NDArray[Any], ...]]:
     """The first steps of an episode of a fixed seed with fixed actions."""
     rng = np.random.default_rng(seed)
     seen: list[tuple[npt.NDArray[Any], ...]] = [(play.begin(np.zeros(1, np.int64), np.asarray([12345])).copy(),)]
-    for _ in range(COMPARED_STEPS // 4):
+    for _ in range(min(steps, COMPARED_STEPS // 4)):
         result = play.step(rng.choice(valid, 1))
         seen.append((result.frames.copy(), result.rewards, result.terminated, result.truncated))
         if len(result.ended):
@@ -246,6 +314,10 @@ def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None, clips:
         notes.append(
             "an episode depends on the episodes before it: a resumed run is not exact; set everything anew in reset"
         )
+    if report.steps_per_s < SLOW_STEPS_PER_S:
+        hours = 100_000 / report.steps_per_s / 3600
+        remedy = "; tasks.subprocesses=true plays its copies at the same time" if report.suite == "gym" else ""
+        notes.append(f"{report.steps_per_s:.3g} steps/s: 100,000 steps of one copy take {hours:,.1f} hours{remedy}")
     if report.draws_globally:
         notes.append("it draws from the global generators; here they are seeded by the episode's seed")
     if not report.seeds_differ:

@@ -74,6 +74,57 @@ def test_what_an_author_should_know_is_a_note(name: str, note: str) -> None:
     assert any(re.match(note, text) for text in report_of(name).notes), report_of(name).notes
 
 
+class SleepsInStep(gymnasium.Env[Any, Any]):
+    """Each step takes three seconds of its own clock."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (3,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    now_s = 0.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        SleepsInStep.now_s += 3.0
+        return np.zeros(3, np.float32), 0.0, False, False, {}
+
+
+gymnasium.register("SleepsInStep-v0", SleepsInStep)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_slow_environment_is_played_for_its_time_and_the_result_says_so() -> None:
+    said: list[str] = []
+    name = f"{__name__}:SleepsInStep-v0"
+    settings: dict[str, Any] = {"steps": 1000, "say": said.append, "clock": lambda: SleepsInStep.now_s}
+    started = SleepsInStep.now_s
+    (report,) = check_env(name, seconds=200.0, **settings)
+    assert report.steps == 34, "the first that ends after 100 seconds"
+    assert report.ended_by_limit_s == 100.0
+    assert report.compared_steps == 2, "100 seconds are 33 steps, and each is compared in 16 plays"
+    assert SleepsInStep.now_s - started <= 200.0 + 3.0
+    assert report.steps_per_s == pytest.approx(1 / 3)
+    assert any(note.startswith("0.333 steps/s: 100,000 steps of one copy take 83.3 hours") for note in report.notes)
+    assert said[0] == f"{name}: random play of 1,000 steps, for 100 s at the most"
+    assert said[1] == f"{name}: 2 of 1,000 steps in 6 s"
+    assert said[-1].startswith(f"{name}: plays 2 steps again")
+    (report,) = check_env(name, seconds=1e-9, **settings)
+    assert (report.steps, report.compared_steps) == (1, 1), "never none"
+    (report,) = check_env(name, seconds=float("inf"), **{**settings, "steps": 300})
+    assert (report.steps, report.ended_by_limit_s, report.compared_steps) == (300, None, 200)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_command_says_that_the_limit_ended_the_play(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        main(["check-env", f"{MODULE}:Plain-v0", "--seconds", "1e-9"])
+    assert done.value.code == 0
+    out, err = capsys.readouterr()
+    assert "0 ended in 1 steps of random play (ended by its limit of 5e-10 s; --seconds raises it)" in out
+    assert "plays the same 1 steps again: yes" in out
+    assert err.splitlines()[0] == f"{MODULE}:Plain-v0: random play of 1,000 steps, for 5e-10 s at the most"
+
+
 def test_drawing_from_global_generators_is_seen_and_does_not_keep_play_from_repeating() -> None:
     report = report_of("GlobalRandom")
     assert report.draws_globally
@@ -120,6 +171,7 @@ def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> Non
         ([f"{MODULE}:"], "expected an id such as CartPole-v1, or module:Id"),
         (["CartPole-v9"], "did you mean 'CartPole-v1'?"),
         (["CartPole-v1", "--steps", "0"], "--steps is 0"),
+        (["CartPole-v1", "--seconds", "nan"], "--seconds is nan, expected more than 0"),
     ],
 )
 def test_the_command_refuses_in_one_line(
