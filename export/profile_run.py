@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from switchmt_snn.acting.agent import Agent
@@ -25,12 +26,14 @@ from switchmt_snn.export.energy.estimate import Energy, Target, estimate
 from switchmt_snn.export.energy.traffic import ann_traffic, traffic
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.export.formats.files import obstacles
+from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
 from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.report.verdict import silent_layers, verdict
 from switchmt_snn.export.selection import Selection
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.environment import command_line
 from switchmt_snn.runs.files import json_text, write_atomically
 from switchmt_snn.runs.packing import open_run
@@ -248,11 +251,16 @@ def _task_facts(
 def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> TaskCounts:
     """Counts on the recording, or on play that begins like it and is not kept."""
     counter = TaskCounter(agent, task)
+    pieces: Iterable[npt.NDArray[Any]]
     if decisions <= KEPT_DECISIONS:
-        counter.add(recording.observations)
+        decisions, pieces = len(recording.observations), chunks(recording.observations)
     else:
-        for piece, _ in play_in_pieces(agent, recording.task, decisions, recording.epsilon, recording.seed):
-            counter.add(piece.reshape(-1, *agent.suite.observation_shape))
+        played = play_in_pieces(agent, recording.task, decisions, recording.epsilon, recording.seed)
+        pieces = (piece.reshape(-1, *agent.suite.observation_shape) for piece, _ in played)
+    with progress_of(f"counting {recording.task}", decisions, "decisions") as progress:
+        for piece in pieces:
+            counter.add(piece)
+            progress.advance(len(piece))
     return counter.counts()
 
 

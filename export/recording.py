@@ -14,6 +14,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.npz import read_npz
 from switchmt_snn.machine.cores import parts
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.files import file_name, written_whole
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
@@ -50,10 +51,18 @@ def recorded_plays(agent: Agent, folder: Path, decisions: int) -> Iterator[Recor
     """``recorded_play`` of every task in turn; while one is used, the next are being played."""
 
     def one(task: str) -> Recording:
-        return recorded_play(agent.independent(), folder, task, decisions, work.check)
+        return recorded_play(agent.independent(), folder, task, decisions, go_on)
 
-    with parts(in_threads=agent.suite.thread_safe) as work:
-        yield from work.map(one, agent.suite.names)
+    def go_on() -> None:
+        work.check()
+        progress.advance(COPIES)
+
+    names = agent.suite.names
+    with (
+        progress_of(f"recording {', '.join(names)}", len(names) * decisions, "decisions") as progress,
+        parts(in_threads=agent.suite.thread_safe) as work,
+    ):
+        yield from work.map(one, names)
 
 
 def recorded_play(

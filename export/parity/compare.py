@@ -22,6 +22,7 @@ from switchmt_snn.export.parity.activity import active_neurons, chunks
 from switchmt_snn.export.runtimes.agents import OnnxAgent, encode, onnx_session
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.machine.cores import all_cores
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.spiking.folding import FoldedNetwork
 
 MIN_EQUAL_ACTIONS = 0.99
@@ -231,8 +232,10 @@ def compare(agent: Agent, exports: Exports, task: int, observations: npt.NDArray
         return results
 
     totals = [Comparison(runtime, name) for runtime in runtimes]
-    with all_cores() as pool:
+    progress = progress_of(f"comparing {', '.join(runtimes)} on {name}", len(observations), "decisions")
+    with progress as work, all_cores() as pool:
         for results in pool.map(compared, *zip(*enumerate(chunks(observations)), strict=True)):
             for total, result in zip(totals, results, strict=True):
                 total.merge(result)
+            work.advance(totals[0].decisions - work.done)
     return totals

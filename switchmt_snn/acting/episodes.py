@@ -78,6 +78,7 @@ class Playing:
         max_episode_steps: longer episodes are cut off.
         note: receives what the user should know.
         go_on: called before every step; what it raises ends the play.
+        ended: called when an episode has ended.
         reseed: of decisions that draw random numbers. They are then drawn anew from an episode's seed for each of its
             decisions, so that an episode does not depend on those beside it; one decision is made after the other.
     """
@@ -87,6 +88,7 @@ class Playing:
     max_episode_steps: int = EvaluationConfig.max_episode_steps
     note: Callable[[str], None] | None = None
     go_on: Callable[[], None] | None = None
+    ended: Callable[[], None] | None = None
     reseed: Callable[[int], None] | None = None
 
 
@@ -161,6 +163,8 @@ def _played(
         for env in np.union1d(played.ended, np.flatnonzero(cut)):
             if running[env]:
                 length = int(play.lengths_steps[env])
+                if playing.ended is not None:
+                    playing.ended()
                 yield EpisodeScore(
                     policy=policy,
                     task=suite.names[task],

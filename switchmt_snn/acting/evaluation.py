@@ -14,6 +14,7 @@ from switchmt_snn.acting.episodes import EpisodeScore, Playing, play_episodes
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.config.numbers import exact
 from switchmt_snn.machine.cores import parts
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -189,7 +190,9 @@ def evaluate_agent(
         if stop is not None and stop():
             raise EvaluationStopped
 
-    settings = Playing(protocol.seed, protocol.epsilon, protocol.max_episode_steps, note, go_on)
+    settings = Playing(
+        protocol.seed, protocol.epsilon, protocol.max_episode_steps, note, go_on, lambda: progress.advance()
+    )
 
     def played(group: tuple[str, int, range]) -> list[EpisodeScore]:
         policy, task, numbers = group
@@ -200,7 +203,8 @@ def evaluate_agent(
             policy, own.q_values, suite, task, numbers, replace(settings, reseed=own.reseed if own.draws else None)
         )
 
-    with parts(in_threads=suite.thread_safe) as work:
+    what, total = f"playing {', '.join(names)}", sum(len(numbers) for *_, numbers in groups)
+    with progress_of(what, total, "episodes") as progress, parts(in_threads=suite.thread_safe) as work:
         now = [episode for group in work.map(played, groups) for episode in group]
     of = {
         (policy, name): [e for e in (*now, *known) if (e.policy, e.task) == (policy, name)]

@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from collections.abc import Callable
+from importlib import import_module
 
 from switchmt_snn import __version__
-from switchmt_snn.cli import (
-    check_env,
-    describe,
-    doctor,
-    evaluate,
-    export,
-    pack,
-    play,
-    profile,
-    report,
-    runs,
-    study,
-    train,
-)
-from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
-from switchmt_snn.machine.program import runnable
-from switchmt_snn.viewing.output import speak_any_encoding
 
 USAGE = """\
 usage: switchmt-snn COMMAND [options]
@@ -44,25 +28,25 @@ usage: switchmt-snn COMMAND [options]
   Exit codes: 0 done, 1 the run failed, 2 wrong use, 130 stopped by Ctrl-C (the same command with --run continues).
 """
 
-COMMANDS: dict[str, Callable[[list[str]], int]] = {
-    "train": train.command,
-    "evaluate": evaluate.command,
-    "play": play.command,
-    "export": export.command,
-    "profile": profile.command,
-    "report": report.command,
-    "study": study.command,
-    "runs": runs.command,
-    "pack": pack.command,
-    "describe": describe.command,
-    "check-env": check_env.command,
-    "doctor": doctor.command,
-}
+COMMANDS = (
+    "train",
+    "evaluate",
+    "play",
+    "export",
+    "profile",
+    "report",
+    "study",
+    "runs",
+    "pack",
+    "describe",
+    "check-env",
+    "doctor",
+)
+"""Each is the function ``command`` of the file of its name, which is imported when it is called for."""
 
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``switchmt-snn``; exits with a code that USAGE lists."""
-    speak_any_encoding()
     sys.exit(_main(sys.argv[1:] if argv is None else argv))
 
 
@@ -74,15 +58,27 @@ def _main(argv: list[str]) -> int:
         print(f"switchmt-snn {__version__}")
         return 0
     try:
-        if argv[0] not in COMMANDS:
-            raise ConfigError(f"unknown command {argv[0]!r}{did_you_mean(argv[0], COMMANDS)}")
-        return COMMANDS[argv[0]](argv[1:])
+        return _called(argv[0], argv[1:])
+    except KeyboardInterrupt:  # also of the imports
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second one ends what is still closing, without a traceback
+        print("switchmt-snn: interrupted", file=sys.stderr)
+        return 130
+
+
+def _called(name: str, options: list[str]) -> int:
+    from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
+    from switchmt_snn.machine.program import runnable
+    from switchmt_snn.viewing.output import speak_any_encoding
+
+    speak_any_encoding()
+    try:
+        if name not in COMMANDS:
+            raise ConfigError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)}")
+        command = import_module(f"switchmt_snn.cli.{name.replace('-', '_')}").command
+        return int(command(options))
     except SwitchMTError as error:
         print(f"switchmt-snn: {runnable(str(error))}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
-        print("switchmt-snn: interrupted", file=sys.stderr)
-        return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 0

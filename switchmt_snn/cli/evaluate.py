@@ -42,6 +42,7 @@ def command(argv: list[str]) -> int:
     options = parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
     from switchmt_snn.runs.packing import open_run
     from switchmt_snn.runs.run import evaluate
+    from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.tables import evaluation_table
 
     path = open_run(run, to_write=True).path
@@ -49,11 +50,13 @@ def command(argv: list[str]) -> int:
     protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     facts: dict[str, Any] = {}
     if options.runtime == "torch":
-        evaluation = evaluate(path, options.task, options.checkpoint, note=_say, **protocol)
+        with ProgressBars():
+            evaluation = evaluate(path, options.task, options.checkpoint, note=_say, **protocol)
     else:
         from switchmt_snn.export.export_run import evaluate_exported
 
-        evaluation, share = evaluate_exported(options.runtime, path, options.task, options.checkpoint, **protocol)
+        with ProgressBars():
+            evaluation, share = evaluate_exported(options.runtime, path, options.task, options.checkpoint, **protocol)
         facts = {"runtime": options.runtime, "equal_actions_share": share}
     if options.json:
         print(json_text({"run": str(path), **facts, **evaluation.to_dict()}))

@@ -45,6 +45,7 @@ def command(argv: list[str]) -> int:
     run, rest = split_one(ExportOptions, argv, "export", ExportOptions())
     options = parse(ExportOptions, rest, "export", ExportOptions())
     from switchmt_snn.export.export_run import ExportSettings, export
+    from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.tables import parity_table
 
     settings = ExportSettings(
@@ -57,13 +58,14 @@ def command(argv: list[str]) -> int:
         parity_decisions=options.parity_decisions,
     )
     console = output.console(stderr=options.json)
-    result = export(
-        Path(run) if run is not None else None,
-        settings,
-        options.checkpoint,
-        options.out,
-        lambda text: console.print(text, highlight=False, soft_wrap=True),
-    )
+    with ProgressBars():
+        result = export(
+            Path(run) if run is not None else None,
+            settings,
+            options.checkpoint,
+            options.out,
+            lambda text: console.print(text, highlight=False, soft_wrap=True),
+        )
     if options.json:
         files = {name: str(path) for name, path in result.files.items()}
         print(json_text({"folder": str(result.folder), "files": files, "parity": result.parity}))

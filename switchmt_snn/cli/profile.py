@@ -43,6 +43,7 @@ def command(argv: list[str]) -> int:
     options = parse(ProfileOptions, rest, "profile", ProfileOptions())
     from switchmt_snn.export import ProfileResult, compare_profiles, profile, profile_file
     from switchmt_snn.runs.packing import open_run
+    from switchmt_snn.viewing.progress_bar import ProgressBars
 
     files = [name for name in names if name.endswith(".nir")]
     if (options.observations is not None) != bool(files):
@@ -62,20 +63,16 @@ def command(argv: list[str]) -> int:
     # With several, --out is for the comparison; each one's own files go to its own folder.
     out = options.out if len(names) < 2 else None
     chosen: list[str | None] = [*names] or [None]  # None is the newest run
-    for name in chosen:
-        if name is not None and name in files:
-            profiles.append(
-                profile_file(
-                    name,
-                    cast(Path, options.observations),
-                    out,
-                    options.target,
-                    options.reset,
-                    options.fires_at_threshold,
+    with ProgressBars():
+        for name in chosen:
+            if name is not None and name in files:
+                observations = cast(Path, options.observations)
+                counted = profile_file(
+                    name, observations, out, options.target, options.reset, options.fires_at_threshold
                 )
-            )
-        else:
-            profiles.append(profile(name, options.decisions, options.checkpoint, out, options.target))
+            else:
+                counted = profile(name, options.decisions, options.checkpoint, out, options.target)
+            profiles.append(counted)
     report = profiles[0].folder / "report.html"
     if len(profiles) > 1:
         report = compare_profiles(profiles, options.out)
