@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import torch
 
-from switchmt_snn.config import ExperimentConfig, clips_rewards, resolve
+from switchmt_snn.config import ExperimentConfig, resolve
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.switching import SwitchingPolicy, check_policy
@@ -82,7 +82,7 @@ def plan(
         check_policy(config.switching)
     with warnings_unless_refused():
         suite = make_suite(config.tasks)
-        warnings = check_before_training(config.tasks, suite, clips_rewards(config))
+        warnings = check_before_training(config, suite)
     SwitchingPolicy(config.switching, len(suite.names), [suite.references.get(name) for name in suite.names])
     if is_plugin(config.network.encoding):
         try_encoding(config.network, suite.observation_shape, suite.frame_stack, suite.in_unit_range)

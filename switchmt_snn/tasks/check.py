@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.config import TasksConfig
+from switchmt_snn.config import ExperimentConfig, clips_rewards
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.play import Play, episode_seed
@@ -28,13 +28,12 @@ def warnings_unless_refused() -> Iterator[None]:
         warnings.warn_explicit(seen.message, seen.category, seen.filename, seen.lineno)
 
 
-def check_before_training(config: TasksConfig, tasks: TaskSuite, clips_rewards: bool) -> tuple[str, ...]:
+def check_before_training(config: ExperimentConfig, tasks: TaskSuite) -> tuple[str, ...]:
     """Play tasks from outside the package for a few steps, twice; a suite must repeat itself, as in ``check_suite``.
 
     Args:
-        config: names the suite.
-        tasks: what ``make_suite(config)`` returned.
-        clips_rewards: ``learning.clip_rewards``.
+        config: names the suite, and says how its rewards are learned from.
+        tasks: what ``make_suite(config.tasks)`` returned.
 
     Returns:
         what the user should know: Gymnasium environments that do not repeat themselves, or whose rewards are clipped.
@@ -43,17 +42,18 @@ def check_before_training(config: TasksConfig, tasks: TaskSuite, clips_rewards: 
         TaskError: naming the task, what was seen, and what was expected.
     """
     notes = []
-    if is_plugin(config.suite):
+    suite, helping = config.tasks.suite, " or a Huber loss" if config.learning.loss == "mse" else ""
+    if is_plugin(suite):
         check_suite(tasks, STEPS_BEFORE_TRAINING)
-    elif config.suite == "gym":
+    elif suite == "gym":
         for task, name in enumerate(tasks.names):
             first, second = (journal(tasks, task, STEPS_BEFORE_TRAINING) for _ in range(2))
             largest = max(float(np.abs(seen[1]).max()) for seen in first[1:])
-            if clips_rewards and largest > 1:
+            if clips_rewards(config) and largest > 1:
                 notes.append(
                     f"warning: task {name!r} gave rewards up to {largest:g}, and learning.clip_rewards=true clips them "
                     "to [-1, 1] for learning, which changes what is best; learning.clip_rewards=false learns from them "
-                    "as they are (a Huber loss or smaller rewards then help)"
+                    f"as they are (smaller rewards{helping} then help)"
                 )
             step = differs_from(first, second)
             if step is not None:

@@ -16,7 +16,7 @@ from switchmt_snn.learning.switching import SwitchTo
 from switchmt_snn.learning.training import Training
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.tasks.registry import suite_of
-from switchmt_snn.viewing.health import health_warnings
+from switchmt_snn.viewing.health import ReturnsSeen, health_warnings
 
 RETURN_WINDOW_EPISODES = 20
 PLAIN_EVERY_S = 15.0
@@ -33,7 +33,7 @@ class Progress:
         self._warming_up = False
         self._warnings: dict[str, str] = {}
         self._said: set[str] = set()  # a plain log says each warning once
-        self._largest_return = 0.0
+        self._seen = ReturnsSeen()
         self._distance = ""
         self._shown_at = 0.0
         self._loss: float | None = None
@@ -67,10 +67,11 @@ class Progress:
             self._show()
         elif isinstance(event, EpisodeEnded):
             self._returns[event.task].append(event.episode_return)
-            self._largest_return = max(self._largest_return, abs(event.episode_return))
+            self._seen.add(event.episode_return, event.length_steps)
         elif isinstance(event, Measured):
             self._loss, self._q = event.loss, event.q
-            self._warnings = health_warnings(event, self._training.config, self._largest_return)
+            warned = health_warnings(event, self._training.config, self._seen)
+            self._warnings = {name: str(warning) for name, warning in warned.items()}
         elif isinstance(event, SwitchDecided) and event.decision.reason != "visit_over":
             self._distance = _distance(event)
 

@@ -13,7 +13,7 @@ import pytest
 
 from switchmt_snn import check_env
 from switchmt_snn.cli.entry import main
-from switchmt_snn.config import TasksConfig, from_dict
+from switchmt_snn.config import from_dict
 from switchmt_snn.errors import TaskError
 from switchmt_snn.runs.plan import plan
 from switchmt_snn.tasks.check import check_before_training, warnings_unless_refused
@@ -211,17 +211,24 @@ def test_warnings_are_shown_after_the_checks_and_not_with_a_refusal() -> None:
 
 
 def test_a_run_says_before_it_starts_that_an_environment_does_not_repeat_itself() -> None:
-    config = TasksConfig(suite="gym", names=(f"{MODULE}:Plain-v0", f"{MODULE}:OwnUnseeded-v0"))
-    (note,) = check_before_training(config, make_suite(config), True)
+    config = from_dict({"tasks": {"suite": "gym", "names": [f"{MODULE}:Plain-v0", f"{MODULE}:OwnUnseeded-v0"]}})
+    (note,) = check_before_training(config, make_suite(config.tasks))
     assert note.startswith(f"warning: task '{MODULE}:OwnUnseeded-v0' differs at step ")
 
 
 def test_a_run_says_before_it_starts_that_it_clips_rewards() -> None:
     """Clipping is Atari's custom: elsewhere it can change what is best."""
-    config = TasksConfig(suite="gym", names=(f"{MODULE}:Plain-v0", f"{MODULE}:LargeRewards-v0"))
-    tasks = make_suite(config)
-    (note,) = check_before_training(config, tasks, clips_rewards=True)
+    names = [f"{MODULE}:Plain-v0", f"{MODULE}:LargeRewards-v0"]
+
+    def notes(**learning: Any) -> tuple[str, ...]:
+        config = from_dict({"tasks": {"suite": "gym", "names": names}, "learning": learning})
+        return check_before_training(config, make_suite(config.tasks))
+
+    (note,) = notes(clip_rewards=True)
     assert note.startswith(
         f"warning: task '{MODULE}:LargeRewards-v0' gave rewards up to 100, and learning.clip_rewards"
     )
-    assert check_before_training(config, tasks, clips_rewards=False) == ()
+    assert note.endswith("(smaller rewards or a Huber loss then help)")
+    (note,) = notes(clip_rewards=True, loss="huber")
+    assert note.endswith("(smaller rewards then help)")
+    assert notes(clip_rewards=False) == notes() == ()

@@ -326,11 +326,11 @@ class OtherCount(CountingEnvironment):
     ],
 )
 def test_a_mistake_in_an_environment_is_one_line_before_training(make, message, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    config = TasksConfig(suite="tests.tasks.test_suites:Counting", names=("a", "b"))
-    tasks = make_suite(config)
-    check_before_training(config, tasks, True)
+    config = ExperimentConfig(tasks=TasksConfig(suite="tests.tasks.test_suites:Counting", names=("a", "b")))
+    tasks = make_suite(config.tasks)
+    check_before_training(config, tasks)
     with pytest.raises(TaskError, match=message) as caught:
-        check_before_training(config, replace(tasks, make=make), True)
+        check_before_training(config, replace(tasks, make=make))
     assert "task 'a'" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -383,12 +383,12 @@ def test_a_gymnasium_environment_is_compared_with_its_declaration(environment, m
     name = f"{environment.__name__}-v0"
     monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
     gymnasium.register(name, environment, max_episode_steps=4)
-    config = TasksConfig(suite="gym", names=(name,))
+    config = ExperimentConfig(tasks=TasksConfig(suite="gym", names=(name,)))
     if message is None:
-        check_before_training(config, make_suite(config), True)
+        check_before_training(config, make_suite(config.tasks))
         return
     with pytest.raises(TaskError, match=message):
-        check_before_training(config, make_suite(config), True)
+        check_before_training(config, make_suite(config.tasks))
 
 
 def test_a_module_that_registers_nothing_is_told_to() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from switchmt_snn.config import NetworkConfig, from_dict, resolve
-from switchmt_snn.config.yaml_io import load_config
+from switchmt_snn.config import ExperimentConfig, NetworkConfig, from_dict, resolve
+from switchmt_snn.config.methods import METHOD_TRAITS, METHODS
+from switchmt_snn.config.yaml_io import load_config, presets
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.events import LayerHealth, Measured, Stepped
 from switchmt_snn.learning.training import Training
@@ -21,11 +23,9 @@ from switchmt_snn.machine.memory import GIB
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.memory import MemoryEstimate, require_memory
 from switchmt_snn.spiking.network import ObservationSpec, build_network
-from switchmt_snn.viewing.health import EARLY_UPDATES, health_warnings
+from switchmt_snn.viewing.health import EARLY_UPDATES, Remedy, ReturnsSeen, Warned, health_warnings
 from switchmt_snn.viewing.progress import Progress
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite
-
-LAYERS = ("linear1", "value", "advantage")
 
 
 def measured(
@@ -34,8 +34,19 @@ def measured(
     return Measured(100, 0, n, 0.1, q, (100,), {layer: LayerHealth(0.2, dead, saturated)})
 
 
+def ended(*returns: float, length_steps: int = 100) -> ReturnsSeen:
+    seen = ReturnsSeen()
+    for one in returns:
+        seen.add(one, length_steps)
+    return seen
+
+
+def warned(seen: Measured, config: ExperimentConfig, returns: ReturnsSeen) -> list[Warned]:
+    return list(health_warnings(seen, config, returns).values())
+
+
 def warnings(seen: Measured, largest_return: float = 100.0, **changes: Any) -> list[str]:
-    return list(health_warnings(seen, resolve(from_dict(changes)), largest_return).values())
+    return [str(one) for one in warned(seen, resolve(from_dict(changes)), ended(largest_return))]
 
 
 def test_a_healthy_run_says_nothing() -> None:
@@ -65,9 +76,11 @@ def test_no_remedy_is_named_that_the_run_has_already() -> None:
     learning = {"loss": "huber", "gradient_clip": "norm", "clip_rewards": True}
     (warning,) = warnings(measured(q=1e6), learning=learning)
     assert warning.endswith("values explode; lower learning.learning_rate (now 0.0001)")
-    (warning,) = warnings(measured(q=1e6), learning={"clip_rewards": False})
+    (warning,) = warnings(measured(q=1e6), 101.0, learning={"clip_rewards": False})
     for words in ("learning.loss=huber", "learning.gradient_clip=norm", "learning.clip_rewards=true"):
         assert words in warning
+    (warning,) = warnings(measured(q=1e6), 100.0, learning={"clip_rewards": False})
+    assert "clip_rewards" not in warning, "rewards of 1 are not clipped"
 
 
 def test_values_explode_beyond_what_returns_allow() -> None:
@@ -78,6 +91,9 @@ def test_values_explode_beyond_what_returns_allow() -> None:
     assert warnings(measured(q=5_000.0), learning={"discount": 0.999}) == []
     assert len(warnings(measured(q=5_000.0), learning={"discount": 0.99})) == 1
     assert warnings(measured(q=1e9), learning={"discount": 1.0}) == []
+    config = resolve(from_dict(raw))
+    assert warned(measured(q=1e9), config, ended()) == [], "no episode has ended: returns of any size may come"
+    assert len(warned(measured(q=1e9), config, ended(0.0))) == 1
 
 
 def test_the_default_run_is_too_short_for_warnings_of_its_own_network() -> None:
@@ -111,11 +127,10 @@ def test_a_plain_log_says_that_a_replay_fills_before_its_first_step(tmp_path: Pa
 GYM = {"suite": "gym", "names": ["CartPole-v1"]}
 
 
-def activity(**network: Any) -> dict[str, tuple[float, float, float]]:
+def activity(network: NetworkConfig) -> dict[str, tuple[float, float, float]]:
     """Shares of silent and of saturated neurons and the mean rate of a fresh network whose statistics have settled."""
-    config = resolve(from_dict({"tasks": GYM, "network": network})).network
     spec = ObservationSpec((4,), frame_stack=1, scale=1.0, in_unit_range=False, num_actions=2, num_tasks=1)
-    made, seen = build_network(config, spec, 1), torch.randn(64, 4, generator=torch.Generator().manual_seed(0)) * 0.2
+    made, seen = build_network(network, spec, 1), torch.randn(64, 4, generator=torch.Generator().manual_seed(0)) * 0.2
     spikes: dict[str, Tensor] = {}
     with torch.no_grad():
         for _ in range(60):
@@ -128,38 +143,106 @@ def activity(**network: Any) -> dict[str, tuple[float, float, float]]:
     }
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-@pytest.mark.parametrize("network", [{}, {"stream_normalization": "batch"}, {"mlp_normalization": "batch"}])
+def changed(config: ExperimentConfig, remedy: Remedy) -> ExperimentConfig:
+    section, name = remedy.key.split(".")
+    changes: dict[str, Any] = {section: replace(getattr(config, section), **{name: remedy.value})}
+    return resolve(replace(config, **changes))
+
+
+@pytest.mark.parametrize("method", ["SwitchMT", "DSQN_D", "DQN_D", "DQN"])
+@pytest.mark.parametrize(
+    "network", [{}, {"stream_normalization": "batch"}, {"mlp_normalization": "batch"}, {"k_winners": 16}]
+)
 @pytest.mark.parametrize(("trouble", "index"), [("dead", 0), ("saturated", 1)])
 def test_every_remedy_for_silence_and_saturation_helps(
-    layer: str, network: dict[str, Any], trouble: str, index: int
+    method: Any, network: dict[str, Any], trouble: str, index: int
 ) -> None:
     """Each remedy that the line names is tried on the layer that it names: the rate goes the right way."""
-    (warning,) = warnings(measured(layer=layer, **{trouble: 1.0}), tasks=GYM, network=network)
-    before, tried = activity(**network)[layer], 0
-    for key, change in REMEDIES.items():
-        if key in warning:
-            settings = resolve(from_dict({"tasks": GYM, "network": network})).network
-            after = activity(**{**network, **change(settings)})[layer]
-            assert (after[2] > before[2]) if trouble == "dead" else (after[2] < before[2] or before[2] == 0.0), key
-            assert after[index] <= before[index]
-            tried += 1
-    assert tried >= 1, f"no known remedy in: {warning}"
+    traits = METHOD_TRAITS[method]
+    if ("k_winners" in network and not traits.dendrites) or (trouble == "saturated" and not traits.spiking):
+        pytest.skip("there is no such network, or no such warning")
+    config = resolve(from_dict({"tasks": GYM, "network": {"method": method, **network}}))
+    before = activity(config.network)
+    for layer in ("linear1", *(("value", "advantage") if traits.dueling else ("q",))):
+        (warning,) = warned(measured(layer=layer, **{trouble: 1.0}), config, ended(1.0))
+        for remedy in warning.remedies:
+            if remedy.key == "learning.learning_rate":
+                continue
+            after = activity(changed(config, remedy).network)[layer]
+            low, high = (before[layer], after) if trouble == "dead" else (after, before[layer])
+            assert low[2] < high[2] or before[layer][2] == 0.0 or not traits.spiking, remedy
+            assert after[index] <= before[layer][index], remedy
 
 
-REMEDIES: dict[str, Callable[[NetworkConfig], dict[str, Any]]] = {
-    "use network.stream_normalization=batch": lambda _: {"stream_normalization": "batch"},
-    "use network.mlp_normalization=batch": lambda _: {"mlp_normalization": "batch"},
-    "raise network.stream_current_thresholds": lambda now: {
-        "stream_current_thresholds": 2 * now.stream_current_thresholds
-    },
-    "lower network.stream_current_thresholds": lambda now: {
-        "stream_current_thresholds": now.stream_current_thresholds / 2
-    },
-    "lower network.threshold": lambda now: {"threshold": now.threshold / 2},
-    "raise network.threshold": lambda now: {"threshold": now.threshold * 2},
-    "raise network.timesteps": lambda now: {"timesteps": now.timesteps * 2},
-}
+VARIANTS: tuple[dict[str, dict[str, Any]], ...] = (
+    {},
+    {"network": {"stream_normalization": "batch", "mlp_normalization": "batch"}},
+    {"network": {"neuron": "LIF", "beta": 0.0, "timesteps": 1}},
+    {"network": {"neuron": "LIF", "timesteps": 4096}},
+    {"network": {"neuron": "tests.spiking.test_own_neurons:Good"}},
+    {"network": {"encoding": "frames"}},
+    {"network": {"k_winners": 8}},
+    {"network": {"k_winners": 127}},
+    {"learning": {"loss": "huber", "gradient_clip": "norm", "clip_rewards": True}},
+    {"learning": {"gradient_clip": "value", "clip_rewards": False}},
+)
+OF_SPIKES = {f"network.{name}" for name in ("threshold", "timesteps", "beta", "k_winners", "stream_current_thresholds")}
+
+
+@pytest.mark.parametrize("preset", presets())
+@pytest.mark.parametrize("method", METHODS)
+def test_no_warning_of_any_run_names_what_it_cannot_do_or_has_done(preset: str, method: Any) -> None:
+    """All warnings, of every preset and method: the settings exist, apply to the method, and are not set already."""
+    original, traits, seen = load_config(preset), METHOD_TRAITS[method], set()
+    for variant in VARIANTS:
+        network = {"method": method, "dendrites": "auto", **variant.get("network", {})}
+        if not traits.spiking:
+            network |= {"encoding": "direct", "readout": "mean", "neuron": "IF"}
+        if not traits.dendrites:
+            network |= {"k_winners": None}
+        config = resolve(
+            replace(
+                original,
+                network=replace(original.network, **network),
+                learning=replace(original.learning, **variant.get("learning", {})),
+            )
+        )
+        trunk = "linear1" if config.network.trunk == "mlp" else "conv1"
+        troubles = [measured(q=1e30)]
+        for layer in (trunk, *(("value", "advantage") if traits.dueling else ("q",))):
+            troubles += [measured(layer=layer, dead=1.0), measured(layer=layer, saturated=1.0)]
+        for trouble in troubles:
+            for returns in (ended(), ended(10.0), ended(1e6)):
+                for name, warning in health_warnings(trouble, config, returns).items():
+                    seen.add(name.split()[0])
+                    assert len(warning.remedies) > 0
+                    for remedy in warning.remedies:
+                        check_is_open(remedy, config, returns)
+                        assert traits.spiking or remedy.key not in OF_SPIKES
+                        assert remedy.text in str(warning)
+                    assert traits.spiking or not re.search("fire|spik|neuron", str(warning))
+    assert seen == ({"large", "silent", "saturated"} if traits.spiking else {"large", "silent"})
+
+
+def check_is_open(remedy: Remedy, config: ExperimentConfig, returns: ReturnsSeen) -> None:
+    section, name = remedy.key.split(".")
+    now = getattr(getattr(config, section), name)
+    after = getattr(getattr(changed(config, remedy), section), name)
+    assert now != after == remedy.value, remedy
+    written = {True: "true"}.get(remedy.value, remedy.value)
+    if remedy.text.startswith("use "):
+        assert remedy.text == f"use {remedy.key}={written}"
+    else:
+        word, key, present = remedy.text.replace("(now ", "").replace(")", "").split()
+        assert (key, float(present)) == (remedy.key, pytest.approx(now, rel=1e-4))
+        assert word == ("raise" if remedy.value is None or remedy.value > now else "lower")
+    network, encoding = config.network, config.network.encoding
+    if remedy.key == "network.timesteps":
+        assert encoding not in ("frames", "events"), "their number of steps is the frame stack's"
+        assert network.neuron == "IF" or network.beta > 0.0
+    assert remedy.key != "network.threshold" or ":" not in network.neuron, "a neuron from outside may have none"
+    assert remedy.key != "network.mlp_normalization" or network.trunk == "mlp"
+    assert remedy.key != "learning.clip_rewards" or returns.reward_reached > 1.0
 
 
 def test_a_run_that_does_not_fit_is_refused_with_numbers() -> None:

@@ -13,7 +13,7 @@ from switchmt_snn.config import to_dict
 from switchmt_snn.drawing.chart import Chart, Timeline
 from switchmt_snn.drawing.numbers import duration
 from switchmt_snn.runs.listing import RETURN_WINDOW_EPISODES, folder_bytes
-from switchmt_snn.viewing.health import health_warnings
+from switchmt_snn.viewing.health import ReturnsSeen, health_warnings
 from switchmt_snn.viewing.report.curves import running_means
 from switchmt_snn.viewing.report.figures import layer_figures, learning_figures, training_figures
 from switchmt_snn.viewing.report.sources import Sources
@@ -142,15 +142,15 @@ def _returns(run: Sources, task: int) -> dict[str, Any]:
 def _warnings(run: Sources) -> list[dict[str, Any]]:
     """What looked wrong at a measurement, by its name: when first and last, how often, the newest words."""
     found: dict[str, dict[str, Any]] = {}
-    largest, episodes = 0.0, iter(run.history.episodes)
+    returns, episodes = ReturnsSeen(), iter(run.history.episodes)
     following = next(episodes, None)
     for measured in run.history.measured:
         while following is not None and following.step <= measured.step:
-            largest = max(largest, abs(following.episode_return))
+            returns.add(following.episode_return, following.length_steps)
             following = next(episodes, None)
-        for name, text in health_warnings(measured, run.config, largest).items():
+        for name, warned in health_warnings(measured, run.config, returns).items():
             one = found.setdefault(name, {"name": name, "first_step": measured.step, "times": 0})
-            one |= {"last_step": measured.step, "times": one["times"] + 1, "text": text}
+            one |= {"last_step": measured.step, "times": one["times"] + 1, "text": str(warned)}
             one["task"] = run.tasks[measured.task]
     count = len(run.history.measured)
     last = run.history.measured[-1].step if count else None
