@@ -104,7 +104,7 @@ def load_study(source: str | Path, overrides: Sequence[str] = (), seeds: Sequenc
     file = _study_file(text, where, path)
     base = _base(file.base, path)
     every = _settings(file.settings, f"{where}: settings")
-    given = _overrides(overrides)
+    given = override_settings(overrides)
     try:
         chosen = _seeds(list(seeds) if seeds else file.seeds)
         variants = {
@@ -237,12 +237,17 @@ def _flat(mapping: dict[Any, Any], before: str = "") -> Iterable[tuple[str, Any]
             yield f"{before}{key}", value
 
 
-def _overrides(words: Sequence[str]) -> dict[str, Any]:
+def override_settings(words: Sequence[str], example: str = "total_steps=2000") -> dict[str, Any]:
+    """Settings by dotted key of the words ``KEY=VALUE`` that follow ``--set``.
+
+    Raises:
+        ConfigError: another word, a key that comes twice, or a setting that is not a user's.
+    """
     settings: dict[str, Any] = {}
     for word in words:
         key, equals, text = word.partition("=")
         if not equals or not key:
-            raise ConfigError(f"--set has {word!r:.80}, expected KEY=VALUE, as total_steps=2000")
+            raise ConfigError(f"--set has {word!r:.80}, expected KEY=VALUE, as {example}")
         value = {key: parse_yaml(text, f"--set {key}", "a value")}
         if key in settings:
             raise ConfigError(f"--set has {key} twice, expected it once")

@@ -101,18 +101,16 @@ class SwitchingPolicy(Stateful):
 
         Args:
             record: of the episode. Those that end in one step are judged in the order of their copies.
-            left: whether another episode of this step ended the visit. The criterion then sees this one, too, and what
-                it measures is reported; nothing more is decided.
+            left: whether an earlier episode ended the visit (in a training: one of the same step). The criterion then
+                sees this one, too, and what it measures is reported; nothing more is decided.
 
         Raises:
             ConfigError: the criterion reports a number that it does not declare in ``columns``, or asks for parameters
                 although it declares no ``snapshots``; one from outside the package fails, or returns no ``Verdict``.
         """
-        decision = self._judge(record)
-        return Stay("visit_over", decision.measured) if left else decision
-
-    def _judge(self, record: EpisodeRecord) -> Stay | SwitchTo:
         if self._must_wait(record):
+            if left:
+                return Stay("visit_over", {})
             if self.must_leave(record.steps_in_visit):
                 return self.leave(record.task, record.steps_in_visit)
             return Stay("no_updates_yet", {}, "no update yet")
@@ -121,6 +119,8 @@ class SwitchingPolicy(Stateful):
         with criterion_code(self.config.policy, "end_of_episode"):
             verdict = self.criterion.end_of_episode(record)
         measured = self._checked(verdict)
+        if left:
+            return Stay("visit_over", measured)
         if self.must_leave(record.steps_in_visit):
             return self._next(record, "max_stay_steps", measured)
         if not verdict.leave:

@@ -7,7 +7,7 @@ must know: the columns of switches.csv, the memory it takes, the line on the scr
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -58,6 +58,8 @@ class EpisodeRecord:
             ask ``values`` about. The same step gives the same draw; training's random numbers stay as they are.
         values: takes observations, and returns their Q-values ``[count, A]`` for the task's actions, by the network
             that learns, in eval mode.
+        recorded: when a finished run is replayed (``switchmt-snn replay-policies``), the numbers that its switches.csv
+            holds for this episode's end, and no network; None in a training.
     """
 
     task: int
@@ -69,6 +71,20 @@ class EpisodeRecord:
     parameters: Callable[[], Tensor]
     observations: Callable[[int], Tensor] = _no_network
     values: Callable[[Tensor], Tensor] = _no_network
+    recorded: Mapping[str, float] | None = None
+
+    def recorded_number(self, column: str) -> float:
+        """A number that the replayed run measured at this episode's end.
+
+        Raises:
+            ConfigError: it measured none.
+        """
+        if self.recorded is None or column not in self.recorded:
+            raise ConfigError(
+                f"the run measured no {column} at episode {self.episodes_in_visit} of a visit, where this policy needs "
+                "one, expected the bounds and switching.judge_learning with which the run was trained"
+            )
+        return self.recorded[column]
 
 
 @dataclass(frozen=True)
@@ -113,11 +129,15 @@ class Criterion(Stateful):
         deciding: which of them decide; charts show these, or all of ``columns`` if it is empty.
         judges_learning: whether it concludes from what was learned. Then it sees no episode of a visit that ended
             before the visit's first update (``switching.judge_learning``). False for a rule that only counts.
+        needs_network: columns that only a network gives, each with the settings under ``switching`` on which it
+            depends. A finished run can be replayed if it has these columns (``EpisodeRecord.recorded``), measured with
+            the same settings.
     """
 
     columns: ClassVar[tuple[str, ...]]
     deciding: ClassVar[tuple[Deciding, ...]] = ()
     judges_learning: ClassVar[bool] = True
+    needs_network: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
     def __init__(self, config: SwitchingConfig) -> None:
         """Take what it needs of the settings in section ``switching``."""

@@ -14,6 +14,7 @@ class ParameterAndReward(Criterion):
 
     columns = (*ParameterChange.columns, *RewardPlateau.columns, "parameter_says_leave", "reward_says_leave")
     deciding = (*ParameterChange.deciding, *RewardPlateau.deciding)
+    needs_network = ParameterChange.needs_network
     SAVED = ("parameter", "reward")
 
     def __init__(self, config: SwitchingConfig) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ class ParameterChange(Criterion):
 
     columns = ("parameter_change", "change_threshold", "snapshots")
     deciding = (Deciding("parameter_change", ("change_threshold",)),)
+    needs_network: ClassVar = {"parameter_change": ("window_episodes",)}
     SAVED = ("history", "updates")
     DERIVED = ("window_episodes", "threshold", "always")
 
@@ -44,15 +45,15 @@ class ParameterChange(Criterion):
 
     def end_of_episode(self, record: EpisodeRecord) -> Verdict:
         """Append theta_t to H_i; measure the relative change over K episodes."""
-        self.history.append(record.parameters())
+        append_snapshot(self.history, record)
         self.updates.append(record.updates)
-        measured = {"change_threshold": self.threshold, "snapshots": float(len(self.history))}
-        if len(self.history) <= self.window_episodes:
+        measured = {"change_threshold": self.threshold, "snapshots": float(len(self.updates))}
+        if len(self.updates) <= self.window_episodes:
             return Verdict(False, "window_fills", measured)
         for values in (self.history, self.updates):
             del values[: len(values) - self.window_episodes - 1]
-        change = relative_change(self.history[0], self.history[-1])
-        measured |= {"parameter_change": change, "snapshots": float(len(self.history))}
+        change = change_over(self.history, record)
+        measured |= {"parameter_change": change, "snapshots": float(len(self.updates))}
         if self.updates[0] == self.updates[-1] and not self.always:
             return Verdict(False, "no_updates_in_window", measured)
         summary = f"change {change:.1%} of {self.threshold:.1%}"
@@ -62,6 +63,19 @@ class ParameterChange(Criterion):
         """Put a saved state back; states of runs that began before updates were kept have none, nor use any."""
         require_saved(state, ("history",), type(self).__name__)
         super().load_state_dict({"updates": [0] * len(state["history"]), **state})
+
+
+def append_snapshot(history: list[Tensor], record: EpisodeRecord) -> None:
+    """Append theta_t; a replayed run has none."""
+    if record.recorded is None:
+        history.append(record.parameters())
+
+
+def change_over(history: list[Tensor], record: EpisodeRecord) -> float:
+    """Relative change from the oldest snapshot to the newest one, or the number that the replayed run measured."""
+    if record.recorded is not None:
+        return record.recorded_number("parameter_change")
+    return relative_change(history[0], history[-1])
 
 
 def relative_change(before: Tensor, after: Tensor) -> float:

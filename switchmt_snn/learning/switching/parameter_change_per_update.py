@@ -6,7 +6,7 @@ from torch import Tensor
 
 from switchmt_snn.config import SwitchingConfig
 from switchmt_snn.learning.switching.criterion import Criterion, Deciding, EpisodeRecord, Verdict, register_criterion
-from switchmt_snn.learning.switching.parameter_change import relative_change
+from switchmt_snn.learning.switching.parameter_change import ParameterChange, append_snapshot, change_over
 
 
 @register_criterion("parameter_change_per_update")
@@ -26,6 +26,7 @@ class ParameterChangePerUpdate(Criterion):
         "change_rate_fraction",
     )
     deciding = (Deciding("change_per_update", ("change_rate_fraction", "largest_change_per_update")),)
+    needs_network = ParameterChange.needs_network
     SAVED = ("history", "updates", "largest")
     DERIVED = ("window_episodes", "fraction")
 
@@ -47,13 +48,13 @@ class ParameterChangePerUpdate(Criterion):
 
     def end_of_episode(self, record: EpisodeRecord) -> Verdict:
         """Measure the change per update over K episodes."""
-        self.history.append(record.parameters())
+        append_snapshot(self.history, record)
         self.updates.append(record.updates)
-        if len(self.history) <= self.window_episodes:
-            return Verdict(False, "window_fills", {"snapshots": float(len(self.history))})
+        if len(self.updates) <= self.window_episodes:
+            return Verdict(False, "window_fills", {"snapshots": float(len(self.updates))})
         del self.history[: len(self.history) - self.window_episodes - 1]
         del self.updates[: len(self.updates) - self.window_episodes - 1]
-        change, updates = relative_change(self.history[0], self.history[-1]), self.updates[-1] - self.updates[0]
+        change, updates = change_over(self.history, record), self.updates[-1] - self.updates[0]
         measured = {"parameter_change": change, "updates_in_window": float(updates)}
         if updates == 0:
             return Verdict(False, "no_updates_yet", measured)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -26,6 +28,7 @@ class ValueChange(Criterion):
         "change_rate_fraction",
     )
     deciding = (Deciding("value_change_per_update", ("change_rate_fraction", "largest_value_change_per_update")),)
+    needs_network: ClassVar = {"value_change": ("window_episodes", "probe_observations")}
     SAVED = ("probe", "values", "updates", "largest")
     DERIVED = ("window_episodes", "fraction", "probe_observations")
 
@@ -44,15 +47,16 @@ class ValueChange(Criterion):
 
     def end_of_episode(self, record: EpisodeRecord) -> Verdict:
         """Ask for Q on the probe, and compare it with Q before K episodes."""
-        if self.probe is None:
-            self.probe = record.observations(self.probe_observations)
-        self.values.append(record.values(self.probe))
+        if record.recorded is None:
+            if self.probe is None:
+                self.probe = record.observations(self.probe_observations)
+            self.values.append(record.values(self.probe))
         self.updates.append(record.updates)
-        if len(self.values) <= self.window_episodes:
+        if len(self.updates) <= self.window_episodes:
             return Verdict(False, "window_fills", {})
         for history in (self.values, self.updates):
             del history[: len(history) - self.window_episodes - 1]
-        change = float(torch.mean(torch.abs(self.values[-1].double() - self.values[0].double())))
+        change = self._change(record)
         updates = self.updates[-1] - self.updates[0]
         measured = {"value_change": change, "updates_in_window": float(updates)}
         if updates == 0:
@@ -63,3 +67,9 @@ class ValueChange(Criterion):
         measured["change_rate_fraction"] = self.fraction
         bound = self.fraction * self.largest
         return Verdict(rate < bound, "value_change", measured, f"change of Q per update {rate:.2e} of {bound:.2e}")
+
+    def _change(self, record: EpisodeRecord) -> float:
+        """Mean absolute change of Q over the window, or the number that the replayed run measured."""
+        if record.recorded is not None:
+            return record.recorded_number("value_change")
+        return float(torch.mean(torch.abs(self.values[-1].double() - self.values[0].double())))

@@ -1,0 +1,54 @@
+"""``switchmt-snn replay-policies``: when each switching policy would have left the visits of a finished run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from switchmt_snn.cli.parsing import parse, split_one
+from switchmt_snn.errors import ConfigError
+from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.viewing import output
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """For each visit of a finished run: at which episode end would each switching policy have said switch?
+
+    Nothing is trained. What would have followed is not known: the policy would have collected other data. Settings are
+    those of the run, unless --set changes them.
+    """
+
+    policy: tuple[str, ...] = ()
+    """Policies, as switching.policy takes them. Default: all that the run's logs can answer for."""
+    set: tuple[str, ...] = ()
+    """Thresholds in place of the run's, each as KEY=VALUE: switching.plateau_t=0.5."""
+    out: Path | None = None
+    """Also write a CSV file with a row for each policy and visit."""
+    json: bool = False
+    """Print summaries and rows as JSON."""
+
+
+def command(argv: list[str]) -> int:
+    """Run the command; returns its exit code."""
+    name, rest = split_one(ReplayOptions, argv, "replay-policies", ReplayOptions())
+    options = parse(ReplayOptions, rest, "replay-policies", ReplayOptions())
+    from switchmt_snn.runs.packing import open_run
+    from switchmt_snn.study.replayed import csv_text, replay_policies, replay_table
+
+    replayed = replay_policies(open_run(name), options.policy, options.set)
+    if options.out is not None:
+        try:
+            write_atomically(options.out, csv_text(replayed).encode())
+        except OSError as error:
+            raise ConfigError(
+                f"--out {options.out} cannot be written ({error.strerror or error}), expected a file in a folder that "
+                "is there and writable; name another one"
+            ) from error
+    if options.json:
+        print(json_text(replayed.to_dict(), indent=1))
+    else:
+        output.console().print(replay_table(replayed))
+        if options.out is not None:
+            print(options.out)
+    return 0
