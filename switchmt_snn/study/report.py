@@ -11,6 +11,7 @@ from typing import Any
 from switchmt_snn.config.numbers import exact
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.study.figures import study_figures
 from switchmt_snn.study.folder import StudyFolder
 from switchmt_snn.study.grid import Study
 from switchmt_snn.study.results import TrialResult, read_results
@@ -55,6 +56,7 @@ def write_study_report(study: Study, folder: StudyFolder) -> Path | None:
         folder.path,
         title=f"Study {study.name}",
         headline=headline,
+        sections=study_figures(study, results),
         tables=[{"title": one.title, "note": one.note, "columns": one.columns, "rows": one.texts()} for one in tables],
     )
 

@@ -157,8 +157,22 @@ def references_of(found: Results) -> dict[str, float]:
     return known
 
 
-def _shares(found: Results) -> Table | None:
-    """Shares of the references, and the comparison with the baseline."""
+@dataclass(frozen=True)
+class Shares:
+    """Shares of the references ``[S, K]`` by variant, of those that play every task with a reference.
+
+    Attributes:
+        floors: by task, what counts as 0; None for 0.
+    """
+
+    tasks: tuple[str, ...]
+    references: dict[str, float]
+    floors: tuple[float, ...] | None
+    by_variant: dict[str, Any]
+
+
+def shares_of(found: Results) -> Shares | None:
+    """Shares of the references; None without at least two references that are known and above their floors."""
     references = references_of(found)
     tasks = [task for task in found.tasks if task in references]
     if len(tasks) < 2 or len(references) < len(found.study.references):
@@ -175,6 +189,15 @@ def _shares(found: Results) -> Table | None:
         scores = found.scores(name, tasks)
         if scores is not None:
             shares[name] = statistics.share_of_reference(scores, [references[task] for task in tasks], floors)
+    return Shares(tuple(tasks), references, None if floors is None else tuple(floors), shares)
+
+
+def _shares(found: Results) -> Table | None:
+    """Shares of the references, and the comparison with the baseline."""
+    known = shares_of(found)
+    if known is None:
+        return None
+    tasks, references, floors, shares = known.tasks, known.references, known.floors, known.by_variant
     rows = []
     compared = _compared(found, {name: statistics.harmonic_mean_over_tasks(one) for name, one in shares.items()})
     for name, share in shares.items():
@@ -194,12 +217,12 @@ def _shares(found: Results) -> Table | None:
             )
         )
     what = "score / reference" if floors is None else "(score - random play) / (reference - random play)"
-    known = ", ".join(f"{task} {digits(references[task])}" for task in tasks)
+    named = ", ".join(f"{task} {digits(references[task])}" for task in tasks)
     baseline = found.study.baseline
     return Table(
         name="shares",
         title="Shares of the references",
-        note=f"min({what}, 1) with the references {known}. IQM: mean of the middle half of all seeds and tasks. "
+        note=f"min({what}, 1) with the references {named}. IQM: mean of the middle half of all seeds and tasks. "
         f"P(> {baseline}): probability that a seed's harmonic mean is above one of the baseline's. p: of no difference "
         "in the harmonic mean over paired seeds (sign flips), after Holm over the variants.",
         columns=("variant", *tasks, "IQM", "minimum", "harmonic mean", f"P(> {baseline})", "p"),

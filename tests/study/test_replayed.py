@@ -33,6 +33,7 @@ QUICK = {
     "visit_episodes": 4,
     "visit_steps": 30,
     "window_episodes": 2,
+    "change_rate_fraction": 0.9,
     "probe_observations": 4,
     "progress_window_steps": 80,
     "check_every_steps": 120,

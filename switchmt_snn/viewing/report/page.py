@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,7 @@ def write_comparison(
     title: str,
     headline: str,
     tables: Sequence[dict[str, Any]] = (),
+    sections: dict[str, list[Chart | Timeline]] | None = None,
     name: str = "report",
 ) -> Path:
     """Write the page of several runs whose groups are known, with tables in place of the scores.
@@ -83,6 +85,7 @@ def write_comparison(
         title: of the page.
         headline: the line below it.
         tables: each with ``title``, ``note``, ``columns`` and ``rows`` of texts.
+        sections: more figures, by the title of their section.
         name: of the files, and of the folder of figures (SVG, PNG by Pillow, CSV) with ``_figures`` behind it.
 
     Returns:
@@ -95,8 +98,10 @@ def write_comparison(
     charts = comparison_figures(compared)
     facts = comparison_facts(compared, differing_settings([group.runs for group in compared]), charts)
     facts |= {"title": title, "headline": headline, "tables": list(tables)}
-    page = _rendered("comparison.html.jinja", facts, {"learning": list(charts)})
-    return _write(out, name, page, facts, charts, f"{name}_figures")
+    drawn: dict[str, list[Chart | Timeline]] = {"learning": list(charts), **(sections or {})}
+    facts["figures"] = {section: [asdict(one) for one in figures] for section, figures in drawn.items()}
+    page = _rendered("comparison.html.jinja", facts, drawn)
+    return _write(out, name, page, facts, [one for figures in drawn.values() for one in figures], f"{name}_figures")
 
 
 def _write(
