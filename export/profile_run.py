@@ -17,6 +17,7 @@ import numpy.typing as npt
 import torch
 
 from switchmt_snn.acting.agent import Agent
+from switchmt_snn.drawing.files import figure_files
 from switchmt_snn.errors import ConfigError, ExportError
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.precision import effect_of_precision
@@ -29,6 +30,7 @@ from switchmt_snn.export.formats.files import obstacles
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
+from switchmt_snn.export.report.figures import energy_figure, spikes_figure
 from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.report.verdict import silent_layers, verdict
@@ -221,8 +223,13 @@ def _written(
         "targets": {target.name: asdict(target) for target in targets},
         "tasks": tasks,
     }
+    figures = [figure for figure in (energy_figure(facts), spikes_figure(facts)) if figure is not None]
+    facts["figures"] = [asdict(figure) for figure in figures]
     write_atomically(folder / "profile.json", json_text(facts, indent=1).encode())
     write_atomically(folder / "layers.csv", _layers_csv(profiles).encode())
+    (folder / "figures").mkdir(exist_ok=True)
+    for name, content in figure_files(figures).items():
+        write_atomically(folder / "figures" / name, content)
     write_atomically(folder / "report.html", render_report([facts], [frames], facts["command"]).encode())
     return ProfileResult(folder, facts, frames)
 

@@ -9,21 +9,29 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from markupsafe import Markup
 from PIL import Image
 
+from switchmt_snn.drawing.chart import WIDE
+from switchmt_snn.drawing.marks import SERIES_COLOURS, series_colour
 from switchmt_snn.drawing.numbers import digits
 from switchmt_snn.drawing.page import FILTERS as PAGE_FILTERS
 from switchmt_snn.drawing.page import page_environment
+from switchmt_snn.drawing.rows import LogRows, rows_picture
+from switchmt_snn.drawing.svg import inline_svg
+from switchmt_snn.export.report.figures import energy_figure, spikes_figure
 
 Frames = Sequence[npt.NDArray[Any]]
 """Frames of each task's stretch of play, ``[n, *frame_shape]``."""
 
-_LAYER_COLOURS = ("#1b6e8c", "#3f9c9c", "#8fbf6a", "#d9b44a", "#c8553d", "#7a4b8c", "#5b6770", "#b07aa1")
+_LAYER_COLOURS = tuple(f"var(--{series_colour(index)})" for index in range(SERIES_COLOURS))
 """A layer's colour in every chart."""
 _CHANNEL_COLOURS = np.array(
     [(38, 70, 83), (42, 157, 143), (233, 196, 106), (231, 111, 81), (120, 80, 160), (90, 160, 220), (150, 150, 150)],
     np.uint8,
 )
+NARROW = 360.0
+"""Width of a figure on a phone, in pixels."""
 _PAPER, _BAND, _SPIKE = 255, 238, 20
 
 
@@ -38,6 +46,7 @@ def render_report(runs: list[dict[str, Any]], frames: Sequence[Frames], command:
     environment = page_environment("switchmt_snn.export.report")
     environment.filters |= FILTERS
     environment.globals |= FILTERS | {"colours": _LAYER_COLOURS, "raster": _raster, "picture": _picture}
+    environment.globals |= {"energy_figure": energy_figure, "spikes_figure": spikes_figure, "drawn": _drawn}
     return environment.get_template("report.html.jinja").render(
         runs=list(zip(runs, frames, strict=True)), command=command
     )
@@ -59,6 +68,12 @@ def thousandth(value: float) -> str:
 
 
 FILTERS = PAGE_FILTERS | {filter.__name__: filter for filter in (microjoule, joule, thousandth)}
+
+
+def _drawn(figure: LogRows) -> Markup:
+    """A figure in two widths, of which the page shows the one that fits."""
+    widths = {"wide": WIDE, "narrow": NARROW}
+    return Markup("").join(Markup(inline_svg(rows_picture(figure, width), name)) for name, width in widths.items())
 
 
 def _raster(layer: dict[str, Any], timesteps: int) -> str:

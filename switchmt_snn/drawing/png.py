@@ -14,6 +14,8 @@ SCALE = 2
 """Pixels of the file per unit of the picture, for print and dense screens."""
 _OVERSAMPLED = 2
 _DASH, _GAP = 5.0, 4.0
+_SPELLED = str.maketrans({"µ": "u"})
+"""What Pillow's font does not have."""
 _ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}
 
 
@@ -48,7 +50,8 @@ def _draw(canvas: ImageDraw.ImageDraw, mark: Mark, scale: float) -> None:
         font = ImageFont.load_default(mark.size * scale)
         place, halo = at(((mark.x, mark.y),))[0], round(1.5 * scale) if mark.halo else 0
         anchor, paper = _ANCHORS[mark.anchor], _paint("paper")
-        canvas.text(place, mark.text, _paint(mark.colour), font, anchor, stroke_width=halo, stroke_fill=paper)
+        text, ink = mark.text.translate(_SPELLED), _paint(mark.colour)
+        canvas.text(place, text, ink, font, anchor, stroke_width=halo, stroke_fill=paper)
     else:
         _box(canvas, mark, scale)
 

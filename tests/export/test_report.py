@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import re
@@ -34,6 +35,7 @@ class Page(HTMLParser):
         super().__init__()
         self.text: list[str] = []
         self.addresses: list[str] = []
+        self.axis: list[str] = []
         self.open: list[str] = []
         self.feed(page)
 
@@ -47,7 +49,9 @@ class Page(HTMLParser):
         assert self.open.pop() == tag, f"{tag} closes another element"
 
     def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] == "text":  # of a drawing: the numbers of its axis
+            self.axis.append(data)
+        elif self.open and self.open[-1] != "style":
             self.text.append(data)
 
 
@@ -220,3 +224,33 @@ def test_the_tables_of_an_ann_speak_of_no_spikes(ann_and_spiking: list[dict[str,
     cells = {label: (one, two) for label, one, two in zip(*(column.cells for column in columns), strict=True)}
     assert cells["spikes"][0] == "" != cells["spikes"][1]
     assert cells["active units (ANN)"][0] != "" == cells["active units (ANN)"][1]
+
+
+def test_figures_show_what_profile_json_says(profiled: Path) -> None:
+    facts = json.loads((profiled / "profile.json").read_text())
+    assert [figure["name"] for figure in facts["figures"]] == ["energy", "spikes"]
+    for kind in ("svg", "png", "csv"):
+        assert {path.stem for path in (profiled / "figures").glob(f"*.{kind}")} == {"energy", "spikes"}
+    with (profiled / "figures" / "energy.csv").open(newline="") as stream:
+        rows = {(row["row"], row["series"]): row for row in csv.DictReader(stream)}
+    for index, target in enumerate(facts["targets"]):
+        totals_pj = [task["energy"][index]["total_pj"] for task in facts["tasks"]]
+        row = rows[target, "whole network"]
+        assert float(row["value"]) == pytest.approx(sum(totals_pj) / len(totals_pj) / 1e6)
+        assert float(row["low"]) == pytest.approx(min(totals_pj) / 1e6)
+        assert float(row["high"]) == pytest.approx(max(totals_pj) / 1e6)
+        names = [layer["name"] for layer in facts["tasks"][0]["layers"]]
+        parts = [float(rows[target, name]["value"]) for name in names]
+        assert sum(parts) == pytest.approx(float(row["value"]))
+    with (profiled / "figures" / "spikes.csv").open(newline="") as stream:
+        seen = list(csv.DictReader(stream))
+    for layer in (layer for layer in facts["tasks"][0]["layers"] if layer["neurons"]):
+        by_step = [float(row["value"]) for row in seen if row["row"] == layer["name"]]
+        assert len(by_step) == facts["timesteps"]
+        total = sum(
+            of_task["spikes_per_decision"]
+            for task in facts["tasks"]
+            for of_task in task["layers"]
+            if of_task["name"] == layer["name"]
+        )
+        assert sum(by_step) == pytest.approx(total / len(facts["tasks"]))
