@@ -224,7 +224,8 @@ def _shares(found: Results) -> Table | None:
         title="Shares of the references",
         note=f"min({what}, 1) with the references {named}. IQM: mean of the middle half of all seeds and tasks. "
         f"P(> {baseline}): probability that a seed's harmonic mean is above one of the baseline's. p: of no difference "
-        "in the harmonic mean over paired seeds (sign flips), after Holm over the variants.",
+        "in the harmonic mean over paired seeds (sign flips), after Holm over the variants; intervals are not "
+        "corrected.",
         columns=("variant", *tasks, "IQM", "minimum", "harmonic mean", f"P(> {baseline})", "p"),
         rows=tuple(rows),
     )
