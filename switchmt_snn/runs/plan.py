@@ -89,7 +89,7 @@ def plan(
     config, notes = decide(config, stored, suite, device, processes)
     _require_lives(config)
     memory = describe_method(config, suite).memory
-    require_memory(memory, config)
+    require_memory(memory, config, suite)
     require_gpu_memory(config, suite)
     return Plan(config, suite, device, memory, (*warnings, *notes))
 

@@ -134,6 +134,7 @@ class AtariSuite(Suite):
     frames_per_s = 60.0
     # Rainbow stays near random play in most games for this many steps (Kaiser et al. 2020, arXiv 1903.00374).
     steps_to_learn = 100_000
+    process_bytes = 20 * 1024**2  # emulators
     masks_actions = True
     references = ATARI_REFERENCES
     published = PUBLISHED_SCORES

@@ -163,6 +163,7 @@ _FACTS: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("frame_skip", lambda skip: _whole(skip) and skip > 0, "a whole number above 0"),
     ("frames_per_s", lambda rate: rate is None or (_number(rate) and rate > 0), "a number above 0, or None"),
     ("steps_to_learn", lambda steps: steps is None or (_whole(steps) and steps > 0), "a whole number above 0, or None"),
+    ("process_bytes", lambda count: _whole(count) and count >= 0, "a whole number of at least 0"),
     ("files", _are_files, "a pathlib.Path of a file that exists, by its name"),
 )
 """What a suite states: the attribute, whether a value will do, and what will."""

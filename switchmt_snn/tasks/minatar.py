@@ -26,6 +26,7 @@ class MinAtarSuite(Suite):
     defaults = SUITE_DEFAULTS["minatar"]
     examples = ("breakout", "asterix")
     packages = ("minatar", "gymnasium")
+    process_bytes = 120 * 1024**2  # MinAtar imports Matplotlib and seaborn
     masks_actions = True
 
     @classmethod

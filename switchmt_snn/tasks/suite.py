@@ -188,6 +188,7 @@ class Suite:
         packages: distributions whose versions a run stores.
         frames_per_s: emulator frames per second of real time; None if the tasks have no clock.
         steps_to_learn: training for fewer agent steps teaches nothing, and a short run says so; None says nothing.
+        process_bytes: memory that the modules and the emulators of the suite take, for the estimate of a run.
         masks_actions: whether ``make`` follows ``tasks.minimal_action_mask``; else that setting is refused.
         takes_wrappers: whether ``make`` follows ``tasks.wrappers``, ``image_layout`` and ``subprocesses``; else they
             are refused.
@@ -203,6 +204,7 @@ class Suite:
     packages: ClassVar[tuple[str, ...]] = ()
     frames_per_s: ClassVar[float | None] = None
     steps_to_learn: ClassVar[int | None] = None
+    process_bytes: ClassVar[int] = 0
     masks_actions: ClassVar[bool] = False
     takes_wrappers: ClassVar[bool] = False
     references: ClassVar[dict[str, Reference]] = {}

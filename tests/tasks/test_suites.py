@@ -236,6 +236,7 @@ def test_what_a_suite_raises_is_one_line(
         ("frames_per_s", "60", "a number above 0, or None"),
         ("frame_skip", 0, "a whole number above 0"),
         ("steps_to_learn", 1e6, "a whole number above 0, or None"),
+        ("process_bytes", 1.5e8, "a whole number of at least 0"),
         ("tasks_with_lives", ("c",), "a tuple of names in"),
         ("packages", "numpy", "a tuple of names"),
         ("masks_actions", "no", "True or False"),

@@ -16,12 +16,9 @@ from torch import Tensor
 from switchmt_snn.config import ExperimentConfig, NetworkConfig, from_dict, resolve
 from switchmt_snn.config.methods import METHOD_TRAITS, METHODS
 from switchmt_snn.config.yaml_io import load_config, presets
-from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.events import LayerHealth, Measured, Stepped
 from switchmt_snn.learning.training import Training
-from switchmt_snn.machine.memory import GIB
 from switchmt_snn.runs.folder import RunFolder
-from switchmt_snn.runs.memory import MemoryEstimate, require_memory
 from switchmt_snn.spiking.network import ObservationSpec, build_network
 from switchmt_snn.viewing.health import EARLY_UPDATES, Remedy, ReturnsSeen, Warned, health_warnings
 from switchmt_snn.viewing.progress import Progress
@@ -243,17 +240,3 @@ def check_is_open(remedy: Remedy, config: ExperimentConfig, returns: ReturnsSeen
     assert remedy.key != "network.threshold" or ":" not in network.neuron, "a neuron from outside may have none"
     assert remedy.key != "network.mlp_normalization" or network.trunk == "mlp"
     assert remedy.key != "learning.clip_rewards" or returns.reward_reached > 1.0
-
-
-def test_a_run_that_does_not_fit_is_refused_with_numbers() -> None:
-    config = resolve(load_config("paper"))
-    estimate = MemoryEstimate(replay_bytes=20 * GIB, network_bytes=GIB, switching_bytes=GIB, activations_bytes=2 * GIB)
-    require_memory(estimate, config, available=25 * GIB)
-    with pytest.raises(ConfigError) as refused:
-        require_memory(estimate, config, available=15 * GIB)
-    for part in ("needs 24.7 GiB", "replay 20.0", "activations 2.0", "15.0 GiB that are available"):
-        assert part in str(refused.value)
-    # 15 - (24 - 20) - 0.68 of the process = 10.3 GiB for the replay, about half of what it has
-    assert "lower learning.replay_capacity_steps to at most 540," in str(refused.value)
-    with pytest.raises(ConfigError, match=r"lower learning\.batch_size and"):
-        require_memory(estimate, config, available=GIB)
