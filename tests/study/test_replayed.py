@@ -281,7 +281,10 @@ def test_a_visit_that_goes_on_after_the_switch_is_seen_but_not_left_again(tmp_pa
     assert len(counted) == sum(row.compared != "open" for row in rows)
 
 
-def test_the_command_prints_a_table_json_and_a_csv(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_a_table_json_and_a_csv(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # no cell is wrapped
     run, _, _ = trained(tmp_path / "run", config_of("reward_plateau", {}))
     out = tmp_path / "rows.csv"
     with pytest.raises(SystemExit) as stop:
