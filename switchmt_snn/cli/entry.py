@@ -18,7 +18,7 @@ usage: switchmt-snn COMMAND [options]
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
   report [RUN ...]    one HTML page: curves, switches, speed, layers, scores; of several runs a comparison
   study CONFIG        many runs: variants, grids and seeds from one YAML file, each a plain run; resumable
-  replay-policies RUN at which episode end each switching policy would have left the visits of a finished run
+  replay-policies [RUN]  at which episode end each policy would have left the visits of a run (default: newest run)
   runs [FOLDER]       the run folders with method, tasks, steps, status, scores and size (default: runs/)
   pack [RUN]          a run without its replay, to give away: config, logs, evaluations, weights (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
