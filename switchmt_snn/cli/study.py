@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.errors import ConfigError, SwitchMTError
 from switchmt_snn.machine.program import program
@@ -16,6 +14,8 @@ from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from switchmt_snn.study.folder import StudyFolder
     from switchmt_snn.study.grid import Study
 

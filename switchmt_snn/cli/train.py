@@ -5,10 +5,9 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
 
 from switchmt_snn.cli.parsing import parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
@@ -16,6 +15,9 @@ from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.machine.program import program, runnable
 from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @dataclass(frozen=True)

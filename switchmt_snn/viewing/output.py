@@ -5,9 +5,10 @@ from __future__ import annotations
 import codecs
 import os
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+if TYPE_CHECKING:
+    from rich.console import Console
 
 FILE_COLUMNS = 200
 """Width of tables in a file or a pipe, which have none of their own."""
@@ -43,6 +44,8 @@ def _ascii(character: str) -> str:
 
 def console(stderr: bool = False) -> Console:
     """Where a command prints: as wide as the terminal, or wide enough for most tables if there is none."""
+    from rich.console import Console  # a tenth of the time that --help takes
+
     made = Console(stderr=stderr, markup=False)  # names may hold brackets
     if not made.is_terminal and "COLUMNS" not in os.environ:
         made.width = FILE_COLUMNS
