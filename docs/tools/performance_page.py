@@ -19,6 +19,7 @@ def performance_page() -> str:
         "update_step",
         "update_512",
         "update_512_handed_back",
+        "against",
         "acting",
         "environments",
         "end_to_end",
@@ -37,6 +38,7 @@ def performance_page() -> str:
         "compare ratios, not milliseconds of different machines. No GPU was available to measure on.",
         *update_part(results["update_step"]),
         *large_batch_part(results["update_512"], results["update_512_handed_back"]),
+        *against_part(results["against"]),
         *acting_part(results["acting"]),
         *loop_part(results["end_to_end"], results["environments"]),
         *scaling_part(results["scaling"]),
@@ -132,6 +134,31 @@ def large_batch_part(kept: dict[str, Any], handed_back: dict[str, Any]) -> list[
         other = handed_back["variants"][name]["median_ms"]
         lines.append(
             f"| {name} | {row['median_ms']:,.0f} | {row['min_ms']:,.0f} | {row['max_ms']:,.0f} | {other:,.0f} |"
+        )
+    return lines
+
+
+def against_part(against: dict[str, Any]) -> list[str]:
+    """Whether this version is slower than an older one."""
+    machine = against["environment"]
+    lines = [
+        "",
+        "## Against an older version",
+        "",
+        f"`python -m benchmarks.against {against['commit']}`: this version and the one before the packages had their "
+        "present shape, in turns,",
+        f"{against['rounds']} rounds on one core of another processor ({machine['processor']}, no bfloat16",
+        "instructions). Ratio: this version's time divided by the older one's, within a round. The plain loop is the",
+        "same code in both: its ratio says how quiet the machine was.",
+        "",
+        "| what | older, median ms | this version, median ms | ratio | smallest | largest |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in against["rows"]:
+        low, high = row["range"]
+        lines.append(
+            f"| {row['what']} | {row['older_ms']:.1f} | {row['this_ms']:.1f} | {row['ratio']:.2f} | {low:.2f} | "
+            f"{high:.2f} |"
         )
     return lines
 
