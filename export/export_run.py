@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -27,8 +28,9 @@ from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, onnx_session, read_nir
+from switchmt_snn.export.runtimes.guarded import read_file
 from switchmt_snn.runs.evaluations import evaluation_name
-from switchmt_snn.runs.files import file_name, json_text, write_atomically, written_whole
+from switchmt_snn.runs.files import file_name, json_text, sha256, write_atomically, written_whole
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.model_card import CARD, model_card
 from switchmt_snn.runs.packing import open_run
@@ -134,6 +136,7 @@ def export(
         raise
     parity["wall_s"] = {"write": written_at - started, "record_and_compare": time.perf_counter() - written_at}
     parity["left_out"] = built.left_out
+    parity["files"] = {path.name: sha256(path.read_bytes()) for path in files.values()}
     write_atomically(folder / "parity.json", json_text(facts | parity, indent=1).encode())
     if parity["dyadic_skipped"] is not None:
         note(f"the exact check was left out: {parity['dyadic_skipped']}")
@@ -354,7 +357,23 @@ def _exported_nir(folder: RunFolder, task: str) -> Path:
 
 
 def _exported(folder: RunFolder, name: str, flag: str) -> Path:
+    """A file of the run's export, as it was when it was compared with the network.
+
+    Raises:
+        ExportError: it is missing, was not compared, or has changed since.
+    """
     path = folder.path / "export" / name
+    again = f"run switchmt-snn export {folder.path} {flag}"
     if not path.is_file():
-        raise ExportError(f"no {path}, expected an exported run; run switchmt-snn export {folder.path} {flag}")
+        raise ExportError(f"no {path}, expected an exported run; {again}")
+    beside = path.with_name("parity.json")
+    try:
+        parity = json.loads(read_file(beside, "what export compared"))
+        files = parity.get("files", {})
+        # Exports from before the sums were kept have none.
+        unchanged = "files" not in parity or files.get(name) == sha256(read_file(path, "an exported file"))
+    except (ExportError, ValueError, RecursionError, AttributeError) as error:
+        raise ExportError(f"{beside} cannot be read, expected what export compared; {again}") from error
+    if not unchanged:
+        raise ExportError(f"{path} is not the file that export compared (another checksum), expected that one; {again}")
     return path

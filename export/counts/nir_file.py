@@ -24,7 +24,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.counts.network import LayerCounts, TaskCounts, layer_counts
 from switchmt_snn.export.counts.nir_convention import NirConvention, doubts, require_stable, stated
 from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
-from switchmt_snn.export.npz import not_finite, read_npz
+from switchmt_snn.export.npz import read_npz
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
@@ -73,7 +73,7 @@ def count_nir(path: Path, observations: Path, reset: str | None = None, fires_at
         ExportError: one of the files cannot be read, they do not fit each other, dt is longer than a time constant, or
             a convention was stated for a file of ours.
     """
-    graph, stored = _graph(path), _arrays(observations)
+    graph, stored = read_nir(path), _arrays(observations)
     own = all(key in graph.metadata for key in _FACTS)
     convention = stated(graph, own, _dt(graph, stored), reset, fires_at_threshold)
     require_stable(graph, convention.dt)
@@ -290,16 +290,6 @@ def _encoded(inputs: Array, shape: tuple[int, ...], facts: dict[str, Any]) -> _I
     once = encoding is not None and encoding.constant_over_time and bool((inputs == inputs[:1]).all())
     batches = (inputs[:, part].astype(np.float32) for part in chunks(np.arange(inputs.shape[1])))
     return _Inputs(inputs.shape[1], len(inputs), spikes, once, batches)
-
-
-def _graph(path: Path) -> nir.NIRGraph:
-    """A graph from a file, with numbers in it only."""
-    graph = read_nir(path)
-    for name, node in graph.nodes.items():
-        for parameter, values in vars(node).items():
-            if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise ExportError(f"{path}: {parameter} of {name} holds {not_finite(values)}, expected finite numbers")
-    return graph
 
 
 def _arrays(path: Path) -> dict[str, Array]:

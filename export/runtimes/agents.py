@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +19,10 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import DecisionMaker
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ExportError
+from switchmt_snn.export.npz import not_finite
+from switchmt_snn.export.runtimes.guarded import nir_tree, read_file, require_runnable
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
+from switchmt_snn.export.runtimes.onnx_walk import require_plain
 from switchmt_snn.spiking.encodings import encoding_class, make_encoding
 from switchmt_snn.spiking.layers import ReadoutNode
 from switchmt_snn.tasks.suite import TaskSuite
@@ -31,28 +33,42 @@ Observations = npt.NDArray[Any]
 def onnx_session(model: Path | bytes, threads: int = 1) -> onnxruntime.InferenceSession:
     """A session; on one thread sums have one order.
 
+    A file is first run once in a child process with limits of time and memory (``guarded``); bytes are of this process.
+
     Raises:
-        ExportError: not an ONNX file, or one that refers to other files (external data).
+        ExportError: not an ONNX file, or one that this package does not run (``onnx_walk``).
     """
+    content = model if isinstance(model, bytes) else read_file(model, "an ONNX file")
     with _readable(model, "an ONNX file"):
-        proto = onnx.load_from_string(model) if isinstance(model, bytes) else onnx.load(model, load_external_data=False)
-        external = [t.name for t in proto.graph.initializer if t.data_location == onnx.TensorProto.EXTERNAL]
-        if external:
-            raise ExportError(f"{model!s:.80} keeps weights in other files ({external[0]}), expected one whole file")
+        require_plain(onnx.load_from_string(content))
+        if not isinstance(model, bytes):
+            require_runnable(content)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
-        return onnxruntime.InferenceSession(proto.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
 
 def read_nir(path: Path) -> nir.NIRGraph:
-    """A NIR graph from a file.
+    """A NIR graph from a file, which a child process reads (``guarded``).
 
     Raises:
-        ExportError: missing, or not a NIR file.
+        ExportError: missing, not a NIR file, or one that holds numbers that are not finite.
     """
+    content = read_file(path, "a NIR file")
     with _readable(path, "a NIR file"):
-        return nir.read(path)
+        graph = nir.dict2NIRNode(nir_tree(content))
+        if not isinstance(graph, nir.NIRGraph):
+            raise ValueError(f"it is a {type(graph).__name__}")
+        for name, node in graph.nodes.items():
+            for parameter, values in vars(node).items():
+                if not isinstance(values, np.ndarray):
+                    continue
+                if values.dtype.kind not in "biuf":
+                    raise ValueError(f"{parameter} of {name!r:.60} holds text, expected numbers")
+                if not np.isfinite(values).all():
+                    raise ValueError(f"{parameter} of {name!r:.60} holds {not_finite(values)}, expected finite numbers")
+        return graph
 
 
 @contextmanager
@@ -63,8 +79,8 @@ def _readable(source: Path | bytes, expected: str) -> Iterator[None]:
         raise
     except Exception as error:  # onnx, onnxruntime, h5py and nir raise whatever their parsers meet
         name = str(source) if isinstance(source, Path) else "a model in memory"
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ExportError(f"{name} cannot be read ({reason:.120}), expected {expected}; export again") from error
+        reason = "".join(letter if letter.isprintable() else " " for letter in str(error)) or type(error).__name__
+        raise ExportError(f"{name} cannot be read ({reason:.160}), expected {expected}; export again") from error
 
 
 def encode(suite: TaskSuite, config: ExperimentConfig, observations: Observations, seed_or_generator: Any) -> Float:
@@ -92,18 +108,38 @@ def existing_only(q_BA: Float, valid_A: npt.NDArray[np.bool_]) -> Float:
     return np.where(valid_A, q_BA, np.float32(-np.inf))
 
 
-def require_numbers(q_BA: Float, valid_A: npt.NDArray[np.bool_], file: str, task: str) -> None:
-    """Refuse Q-values ``[B, A]`` of existing actions that are not finite: the largest of them says nothing.
+def require_numbers(q_BA: Float, batch: int, valid_A: npt.NDArray[np.bool_], file: str, task: str) -> None:
+    """Refuse what are no Q-values ``[B, A]``, and those of existing actions that are not finite: their largest says
+    nothing.
 
     Raises:
-        ExportError: one is NaN or infinite.
+        ExportError: another shape, or one is NaN or infinite.
     """
+    if q_BA.shape != (batch, len(valid_A)) or q_BA.dtype.kind != "f":
+        raise ExportError(
+            f"the {file} file gives Q-values of type {q_BA.dtype} and shape {q_BA.shape} in {task}, expected floats of "
+            f"shape {(batch, len(valid_A))}; export the run again"
+        )
     seen = q_BA[:, valid_A]
     if not np.isfinite(seen).all():
         raise ExportError(
             f"the {file} file gives the Q-value {seen[~np.isfinite(seen)][0]} in {task}, expected finite numbers; "
             "export the run again"
         )
+
+
+def training_step(stored: Any) -> int:
+    """The training step in a file's metadata.
+
+    Raises:
+        ExportError: it is no whole number.
+    """
+    try:
+        return int(stored)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ExportError(
+            f"the exported file's training_step is {stored!r:.60}, expected a whole number; export the run again"
+        ) from error
 
 
 class OnnxAgent:
@@ -124,7 +160,7 @@ class OnnxAgent:
         """
         self.session = onnx_session(model, threads)
         self.suite, self.config = suite, config
-        self.step = int(json.loads(self.session.get_modelmeta().custom_metadata_map["training_step"]))
+        self.step = training_step(self.session.get_modelmeta().custom_metadata_map.get("training_step"))
         self._inputs = [value.name for value in self.session.get_inputs()]
         self._generator = torch.Generator()
 
@@ -156,13 +192,29 @@ class OnnxAgent:
         if "task" in self._inputs:
             fed["task"] = tasks_B
         names = [value.name for value in self.session.get_outputs()]
-        return dict(zip(names, self.session.run(names, fed), strict=True))
+        return dict(zip(names, self._run(names, fed), strict=True))
+
+    def _run(self, names: list[str], fed: dict[str, Any]) -> list[npt.NDArray[Any]]:
+        try:
+            values: list[npt.NDArray[Any]] = self.session.run(names, fed)
+        except Exception as error:  # onnxruntime raises classes of its own, and ValueError for inputs that do not fit
+            reason = " ".join(str(error).split())
+            raise ExportError(
+                f"the ONNX file cannot decide ({reason:.160}), expected a model of this run; export the run again"
+            ) from error
+        return values
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
         """Q-values ``[B, A]`` of a task (name or index); -inf where an action does not exist."""
         index = self.suite.index(task)
-        values: npt.NDArray[np.float32] = self.decide(observation, np.full(len(observation), index))["q_values"]
-        require_numbers(values, self.suite.valid_actions_KA[index], "ONNX", self.suite.names[index])
+        outputs = self.decide(observation, np.full(len(observation), index))
+        if "q_values" not in outputs:
+            raise ExportError(
+                f"the ONNX file gives {', '.join(outputs)!r:.80}, expected q_values; export the run again"
+            )
+        values: npt.NDArray[np.float32] = outputs["q_values"]
+        valid_A = self.suite.valid_actions_KA[index]
+        require_numbers(values, len(observation), valid_A, "ONNX", self.suite.names[index])
         return values
 
 
@@ -176,7 +228,7 @@ class NirAgent:
             name: NirInterpreter(graph, reset=str(graph.metadata.get("reset", "zero")))
             for name, graph in graphs.items()
         }
-        self.step = int(next(iter(graphs.values())).metadata["training_step"])
+        self.step = training_step(next(iter(graphs.values())).metadata.get("training_step"))
         self._generator = torch.Generator()
 
     def independent(self) -> NirAgent:
@@ -200,9 +252,12 @@ class NirAgent:
         encoded = encode(self.suite, self.config, observation, self._generator)
         outputs, _ = self.interpreters[self.suite.names[index]].run(encoded)
         settings = self.config.network
-        q_BA = ReadoutNode(settings.readout, settings.readout_beta)(outputs)
-        require_numbers(q_BA, self.suite.valid_actions_KA[index], "NIR", self.suite.names[index])
-        return existing_only(q_BA, self.suite.valid_actions_KA[index])
+        q_BA, valid_A = (
+            ReadoutNode(settings.readout, settings.readout_beta)(outputs),
+            self.suite.valid_actions_KA[index],
+        )
+        require_numbers(q_BA, len(observation), valid_A, "NIR", self.suite.names[index])
+        return existing_only(q_BA, valid_A)
 
 
 class ComparedAgent:

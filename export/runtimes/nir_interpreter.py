@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.errors import ExportError
+from switchmt_snn.export.runtimes.nir_shapes import MOST_NODES, signal_shapes
 
 Float = npt.NDArray[np.float32]
 Step = Callable[[Float], Float]
@@ -49,6 +50,7 @@ class NirInterpreter:
         order: names of the nodes in forward order.
         sources: names of the nodes whose outputs each node receives; their sum is its input.
         geometry: stride and zero padding of each Conv2d node.
+        shapes: of each node's output, without the batch.
 
     Raises:
         ExportError: the graph has nodes or a structure that is not known here, or there is no such reset.
@@ -65,7 +67,7 @@ class NirInterpreter:
         if dt is None:
             if "dt" not in graph.metadata:
                 raise ExportError("the NIR graph's metadata has no dt, expected the length of a step; pass dt")
-            dt = float(graph.metadata["dt"])
+            dt = _length(graph.metadata["dt"])
         if reset not in RESETS:
             raise ExportError(f"the reset of NIR neurons is {reset!r}, expected one of {', '.join(RESETS)}")
         self.graph, self.dt, self.reset, self.floor = graph, dt, reset, floor
@@ -73,6 +75,8 @@ class NirInterpreter:
         unknown = {type(node).__name__ for node in graph.nodes.values()} - {*_KNOWN, "Input", "Output"}
         if unknown:
             raise ExportError(f"the NIR graph has {', '.join(sorted(unknown))}, expected only {', '.join(_KNOWN)}")
+        if len(graph.nodes) > MOST_NODES:
+            raise ExportError(f"the NIR graph has {len(graph.nodes):,} nodes, expected at most {MOST_NODES}")
         for name, node in graph.nodes.items():
             _check_shape(name, node)
         self.input, self.output = _only(graph, nir.Input), _only(graph, nir.Output)
@@ -88,6 +92,7 @@ class NirInterpreter:
         self.geometry = {
             name: _geometry(name, node) for name, node in graph.nodes.items() if isinstance(node, nir.Conv2d)
         }
+        self.shapes = signal_shapes(graph, self.order, self.sources, self.feedback, self.geometry)
 
     def run(self, inputs_TB: Float, record: list[str] | None = None) -> tuple[Float, dict[str, Float]]:
         """Simulate T steps from rest.
@@ -98,7 +103,15 @@ class NirInterpreter:
 
         Returns:
             The output node's values ``[T, B, ...]``, and the recorded ones by name.
+
+        Raises:
+            ExportError: the inputs have another shape than the Input node.
         """
+        if inputs_TB.shape[2:] != self.shapes[self.input]:
+            raise ExportError(
+                f"the NIR graph's Input has the shape {self.shapes[self.input]}, expected {inputs_TB.shape[2:]} as "
+                "it is given; export the run again"
+            )
         steps: dict[str, Step] = {
             name: self._stepper(name, node) for name, node in self.graph.nodes.items() if type(node).__name__ in _KNOWN
         }
@@ -230,8 +243,18 @@ def _padded(x: Float, padding: Pair) -> Float:
     return around
 
 
+def _length(dt: Any) -> float:
+    """Length of a step from a graph's metadata."""
+    if np.size(dt) == 1 and np.asarray(dt).dtype.kind in "iuf" and 0 < np.ravel(dt)[0] < np.inf:
+        return float(np.ravel(dt)[0])
+    raise ExportError(f"the NIR graph's dt is {dt!s:.60}, expected one number above 0; export the run again")
+
+
 def _check_shape(name: str, node: nir.NIRNode) -> None:
     """Refuse what NIR allows in shapes and the interpreter would get wrong."""
+    for parameter in ("tau", "tau_syn", "tau_mem"):
+        if not (np.asarray(getattr(node, parameter, 1.0)) > 0).all():
+            raise ExportError(f"the NIR node {name} has a {parameter} of 0 or less, expected numbers above 0")
     if isinstance(node, (nir.Affine, nir.Linear)) and node.weight.ndim != 2:
         raise ExportError(f"the NIR node {name} has weights of shape {node.weight.shape}, expected (outputs, inputs)")
     if isinstance(node, nir.Flatten):
@@ -249,9 +272,9 @@ def _geometry(name: str, node: nir.Conv2d) -> tuple[Pair, Pair]:
     for what in ("dilation", "groups"):
         value = getattr(node, what)
         if (np.ravel(value) != 1).any():
-            raise ExportError(f"the NIR node {name} has {what} {_plain(value)}, expected 1")
+            raise ExportError(f"the NIR node {name} has {what} {_plain(value)!s:.60}, expected 1")
     stride = _pair(name, "stride", node.stride, 1)
-    if not isinstance(node.padding, str):
+    if not isinstance(node.padding, str) or node.padding not in ("valid", "same"):
         return stride, _pair(name, "padding", node.padding, 0)
     if node.padding == "valid":
         return stride, (0, 0)
@@ -266,8 +289,9 @@ def _geometry(name: str, node: nir.Conv2d) -> tuple[Pair, Pair]:
 
 def _pair(name: str, what: str, value: Any, least: int) -> Pair:
     pair = np.ravel(value)
-    if pair.size not in (1, 2) or (pair < least).any():
-        raise ExportError(f"the NIR node {name} has {what} {_plain(value)}, expected one or two numbers >= {least}")
+    if pair.size not in (1, 2) or pair.dtype.kind not in "iu" or (pair < least).any():
+        seen = f"{_plain(value)!s:.60}"
+        raise ExportError(f"the NIR node {name} has {what} {seen}, expected one or two numbers >= {least}")
     return int(pair[0]), int(pair[-1])
 
 

@@ -103,7 +103,10 @@ def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: R
     run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
     (trained_run / "export" / "decision.onnx").write_bytes(b"damaged")
     _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
-    assert "cannot be read" in err
+    assert "is not the file that export compared" in err
+    (trained_run / "export" / "parity.json").unlink()
+    _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
+    assert "parity.json cannot be read" in err
 
 
 def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(trained_run: Path, run_command: RunCommand) -> None:

@@ -135,7 +135,7 @@ def test_an_archive_that_numpy_does_not_write_is_one_line(
 def test_q_values_that_are_no_numbers_are_refused(value: float) -> None:
     valid = np.asarray([True, True, False])
     q_values = np.asarray([[0.0, 1.0, -np.inf], [2.0, 3.0, np.nan]], np.float32)
-    require_numbers(q_values, valid, "ONNX", "breakout")
+    require_numbers(q_values, len(q_values), valid, "ONNX", "breakout")
     q_values[1, 0] = value
     with pytest.raises(ExportError, match=f"the ONNX file gives the Q-value {value} in breakout, expected finite"):
-        require_numbers(q_values, valid, "ONNX", "breakout")
+        require_numbers(q_values, len(q_values), valid, "ONNX", "breakout")
