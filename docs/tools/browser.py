@@ -123,8 +123,8 @@ class Browser:
         return Look(int(height), tuple(too_wide), tuple(complaints), tuple(requests))
 
     def evaluate(self, script: str) -> Any:
-        """The value of a JavaScript expression in the open page."""
-        answer = self._call("Runtime.evaluate", expression=script, returnByValue=True)
+        """The value of a JavaScript expression in the open page; a promise is waited for."""
+        answer = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in answer:
             raise TrainingFailed(f"the page's script failed: {answer['exceptionDetails'].get('text')}")
         return answer["result"].get("value")

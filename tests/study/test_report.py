@@ -18,6 +18,7 @@ from switchmt_snn.study.folder import StudyFolder
 from switchmt_snn.study.grid import Study, Trial
 from switchmt_snn.study.report import write_study_report
 from switchmt_snn.study.results import read_results
+from tests.pages import assert_sound
 from tests.viewing.test_run_report import Page
 
 RESULTS = Path(__file__).parents[2] / "results" / "minatar"
@@ -147,6 +148,11 @@ def test_tables_and_page_say_what_is_missing_and_the_same_numbers(finished: tupl
     }
     write_study_report(study, folder)
     assert before == {name: (folder.path / name).read_bytes() for name in before}
+
+
+@pytest.mark.slow
+def test_the_page_is_sound_in_a_browser(finished: tuple[Study, StudyFolder]) -> None:
+    assert_sound(finished[1].path / "report.html")
 
 
 def test_a_study_without_a_finished_trial_has_no_report(tmp_path: Path) -> None:

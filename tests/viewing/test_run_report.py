@@ -15,6 +15,7 @@ import pytest
 
 from switchmt_snn.cli import main
 from switchmt_snn.viewing.report.page import write_report
+from tests.pages import assert_sound
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -152,6 +153,12 @@ def test_every_number_of_the_page_is_in_the_json_beside_it(runs: list[Path], tmp
     for one in (reference for figure in figures for reference in figure.get("references", [])):
         allowed |= set(NUMBER.findall(one["name"])) | set(NUMBER.findall(FILTERS["digits"](one["y"])))
     assert not set(NUMBER.findall(" ".join(shown))) - allowed
+
+
+@pytest.mark.slow
+def test_the_pages_are_sound_in_a_browser(lagging: Path, tmp_path: Path) -> None:
+    assert_sound(lagging)
+    assert_sound(write_report([*SEEDS[:2], DQN], tmp_path))
 
 
 def test_figures_are_files_in_three_formats_with_their_data(lagging: Path) -> None:
