@@ -76,7 +76,7 @@ def recorded_play(
     config = agent.config.evaluation
     path = folder / f"{file_name(task)}-step-{agent.step}.npz"
     if path.exists():
-        recording = _read(path, task, agent.suite)
+        recording = read_recording(path, task, agent.suite)
         if len(recording.actions) >= decisions and recording.seed == config.seed:
             return _first(recording, decisions)
     recording = play(agent, task, decisions, config.epsilon, config.seed, go_on)
@@ -103,7 +103,12 @@ def _first(recording: Recording, decisions: int) -> Recording:
     return replace(recording, observations=np.ascontiguousarray(observations), actions=actions)
 
 
-def _read(path: Path, task: str, suite: TaskSuite) -> Recording:
+def read_recording(path: Path, task: str, suite: TaskSuite) -> Recording:
+    """Recorded play from a file.
+
+    Raises:
+        ExportError: it is none of this task.
+    """
     stored = read_npz(path, _KEYS, "recorded play of this run; delete it")
     for key in _KEYS:
         if key not in stored:

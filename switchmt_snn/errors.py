@@ -74,6 +74,15 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
+def printable(text: str) -> str:
+    """Text of a file or of another program on one line of printable characters.
+
+    >>> printable("a\\n\\x1b[2J")
+    'a ?[2J'
+    """
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+
+
 def require_saved(state: object, names: Iterable[str], owner: str) -> None:
     """Refuse a saved state that lacks what its owner reads from it.
 

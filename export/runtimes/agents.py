@@ -46,7 +46,13 @@ def onnx_session(model: Path | bytes, threads: int = 1) -> onnxruntime.Inference
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        # Names and metadata that are no text fail when they are asked for.
+        _ = (
+            session.get_modelmeta().custom_metadata_map,
+            [value.name for value in (*session.get_inputs(), *session.get_outputs())],
+        )
+        return session
 
 
 def read_nir(path: Path) -> nir.NIRGraph:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from switchmt_snn.errors import CheckpointError, ConfigError, require_saved
+from switchmt_snn.learning.saved_values import require_like, require_moments
 
 
 class Stateful:
@@ -38,8 +39,12 @@ class Stateful:
         """
         owner = type(self).__name__
         require_saved(state, self.SAVED, owner)
+        ours = type(self).__module__.startswith("switchmt_snn.")  # parts from outside may save any kind of value
         for name in self.SAVED:
-            setattr(self, name, _unpacked(getattr(self, name), state[name], f"{name} of {owner}"))
+            present, described = getattr(self, name), f"{name} of {owner}"
+            if ours and not isinstance(present, torch.Tensor) and not _is_part(present):
+                require_like(present, state[name], described)
+            setattr(self, name, _unpacked(present, state[name], described))
 
 
 def require_storable(value: Any, name: str) -> None:
@@ -81,6 +86,13 @@ def _packed(value: Any) -> Any:
     return value.copy() if isinstance(value, (list, dict, np.ndarray)) else value
 
 
+def _is_part(value: Any) -> bool:
+    """Whether a value takes its state itself."""
+    if isinstance(value, list) and value:
+        return isinstance(value[0], torch.Tensor) or hasattr(value[0], "load_state_dict")
+    return isinstance(value, (np.random.Generator, torch.Generator)) or hasattr(value, "load_state_dict")
+
+
 def _unpacked(current: Any, saved: Any, name: str) -> Any:
     if isinstance(current, np.random.Generator):
         with _fitting(name, "the state of such a random generator"):
@@ -92,6 +104,7 @@ def _unpacked(current: Any, saved: Any, name: str) -> Any:
         return current
     if isinstance(current, torch.optim.Optimizer):
         with _fitting(name, "the state of an optimizer of the same parameters"):
+            require_moments(current, saved, name)
             current.load_state_dict(saved)
         return current
     if hasattr(current, "load_state_dict"):
@@ -127,7 +140,7 @@ def tensors_like(current: list[torch.Tensor], saved: Any, name: str) -> list[tor
 
 
 def _tensor_like(current: torch.Tensor, saved: Any, name: str) -> torch.Tensor:
-    if not isinstance(saved, torch.Tensor) or saved.shape != current.shape:
+    if not isinstance(saved, torch.Tensor) or saved.shape != current.shape or saved.is_complex():
         raise _unfitting(name, _kind(saved), _kind(current))
     return saved
 
@@ -150,6 +163,6 @@ def _fitting(name: str, expected: str) -> Iterator[None]:
     """Around PyTorch's and NumPy's own loading: what they raise about a state that does not fit becomes one line."""
     try:
         yield
-    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise _unfitting(name, f"a state that does not fit ({reason:.300})", expected) from error

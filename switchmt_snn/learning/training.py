@@ -25,6 +25,7 @@ from switchmt_snn.learning.exploration import Exploration
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.measuring import layer_health, updates_to_settle
 from switchmt_snn.learning.return_scale import make_return_scales
+from switchmt_snn.learning.saved_values import require_sound
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.statistics import reestimate_statistics
@@ -381,6 +382,7 @@ class Training(Stateful):
         if self.exploration.longest_steps == 1:
             older["exploration"] = self.exploration.state_dict()
         super().load_state_dict({**older, **state})
+        require_sound(self, state["plays"])
         replayed = [self._play(int(task)).load_state_dict(play) for task, play in state["plays"].items()]
         self.reproducible = all(replayed)
 

@@ -80,6 +80,10 @@ class Segment:
     complete: bool
 
 
+_MOST_STEPS = 2**53
+"""Of a lane: more than any run makes."""
+
+
 class FrameReplay:
     """A ring of the newest transitions of one task.
 
@@ -289,7 +293,7 @@ class FrameReplay:
         Raises:
             CheckpointError: the state is not whole, or of another size; nothing is changed.
         """
-        self._require_fits(state)
+        self.require_fits(state)
         self._written[:] = state["written"]
         self._oldest[:] = state["oldest"]
         self.transitions_added = int(state["transitions_added"])
@@ -299,18 +303,72 @@ class FrameReplay:
                 part[:] = state[name][offset : offset + len(part)]
                 offset += len(part)
 
-    def _require_fits(self, state: dict[str, Any]) -> None:
+    def require_fits(self, state: dict[str, Any]) -> None:
+        """Refuse a state that is not whole, of another size, or of which samples could not be drawn.
+
+        Raises:
+            CheckpointError: naming the array.
+        """
         owner, arrays = type(self).__name__, self._arrays()
         require_saved(state, ("written", "oldest", "transitions_added", *arrays), owner)
         lanes = np.shape(self._written)
-        held = np.minimum(state["written"], self.slots).sum() if np.shape(state["written"]) == lanes else -1
+        whole = np.shape(state["written"]) == lanes and np.asarray(state["written"]).dtype.kind == "i"
+        held = int(np.minimum(state["written"], self.slots).sum()) if whole else -1
         expected = {"written": lanes, "oldest": lanes, **dict.fromkeys(arrays, (held,))}
+        dtypes = {"written": self._written.dtype, "oldest": self._oldest.dtype}
+        dtypes |= {name: array.dtype for name, array in arrays.items()}  # older versions had shorter ones
         for name, shape in expected.items():
-            if np.shape(state[name]) != shape:
+            if np.shape(state[name]) != shape or np.asarray(state[name]).dtype.kind != dtypes[name].kind:
                 raise CheckpointError(
-                    f"the checkpoint has {name} of shape {np.shape(state[name])} of {owner}, expected {shape}; set "
+                    f"the checkpoint has {name} of shape {np.shape(state[name])} and type "
+                    f"{np.asarray(state[name]).dtype!s:.20} of {owner}, expected {shape} and {dtypes[name]}; set "
                     "tasks.num_envs and learning.replay_capacity_steps as they were, or start a new run with --run"
                 )
+        if unsound := self._unsound(state):
+            raise CheckpointError(
+                f"the checkpoint has {unsound} of {owner}, expected what a run saves; start a new run"
+            )
+
+    def _unsound(self, state: dict[str, Any]) -> str:
+        """What of a state of the right shapes breaks the invariants of ``check_valid``; empty if nothing does."""
+        written, oldest, added = state["written"], state["oldest"], state["transitions_added"]
+        if not isinstance(added, int) or not 0 <= added < _MOST_STEPS:
+            return "transitions_added out of range"
+        if (oldest < 0).any() or (oldest > written).any() or (written - oldest > self.slots).any():
+            return "positions of frames out of range"
+        if (written >= _MOST_STEPS).any() or not np.isfinite(state["rewards"]).all():
+            return "positions or rewards that are no numbers of a run"
+        if (state["age"] >= self.stack).any() or (state["actions"] < -1).any():
+            return "ages or actions out of range"
+        offset = 0
+        for lane_written, lane_oldest in zip(written.tolist(), oldest.tolist(), strict=True):
+            length = min(lane_written, self.slots)
+            part = slice(offset, offset + length)
+            valid = np.flatnonzero(state["valid"][part])
+            behind_newest = (lane_written - 1 - valid) % self.slots
+            reach = behind_newest + state["age"][part][valid]
+            if (behind_newest < 1).any() or (reach >= lane_written - lane_oldest).any():
+                return "transitions whose frames are gone"
+            if (state["actions"][part][valid] < 0).any():
+                return "transitions without an action"
+            offset += length
+        return ""
+
+    def actions_held(self) -> npt.NDArray[np.int32]:
+        """Actions of the transitions that can be sampled."""
+        return self._actions[self._valid]
+
+    def segments_of(self, state: dict[str, Any]) -> dict[tuple[int, int], int]:
+        """Frames of each segment that belongs to a state, by lane and number.
+
+        Args:
+            state: one that fits.
+        """
+        found = {}
+        for lane, (written, oldest) in enumerate(zip(state["written"].tolist(), state["oldest"].tolist(), strict=True)):
+            for number in range(oldest // SEGMENT_SLOTS, -(-written // SEGMENT_SLOTS)):
+                found[lane, number] = min(SEGMENT_SLOTS, written - number * SEGMENT_SLOTS)
+        return found
 
     def _arrays(self) -> dict[str, npt.NDArray[Any]]:
         return {

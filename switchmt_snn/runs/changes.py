@@ -11,8 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from switchmt_snn.errors import RunFolderError
+from switchmt_snn.errors import RunFolderError, printable
 from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.runs.folder import read_environment
 
 CONDITIONS = ("python", "processor", "torch_threads", "device", "device_name")
 """What of environment.json, with the versions, decides how sums are rounded; a resume is bitwise if all are equal."""
@@ -39,14 +40,16 @@ def note_changes(folder: Path, environment: dict[str, Any], step: int) -> list[s
     path = folder / "code_changes.jsonl"
     now = {"files_sha256": environment["files_sha256"], "conditions": conditions(environment)}
     try:
-        begun = json.loads((folder / "environment.json").read_bytes())
+        begun = read_environment(folder)
         known = {"files_sha256": dict(begun.get("files_sha256", {})), "conditions": conditions(begun)}
         rows = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
         for row in rows:
             for kind, values in known.items():
                 values |= row.get(kind, {})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected JSON lines; delete it") from error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise RunFolderError(
+            f"{path} cannot be read ({printable(str(error)):.80}), expected JSON lines; delete it"
+        ) from error
     new = {kind: _differing(known[kind], values) for kind, values in now.items()}
     if any(new.values()):
         rows.append({"step": step, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **new})

@@ -23,15 +23,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import safetensors
 import safetensors.torch
 import torch
 import zstandard
 
-from switchmt_snn.errors import CheckpointError, require_saved
-from switchmt_snn.replay.ring import SEGMENT_SLOTS, FrameReplay, Segment
+from switchmt_snn.errors import CheckpointError, require_saved, shown
+from switchmt_snn.replay.ring import FrameReplay, Segment
 from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
 from switchmt_snn.runs.manifest import FORMAT, read_json, read_manifest, seal
+from switchmt_snn.runs.state_tree import MODEL_PREFIXES, join, split
 
 _CONTINUED = 3
 """The oldest format that can be continued. Weights are read from any."""
@@ -94,6 +96,10 @@ class _WeightsOnly(CheckpointError):
     """A checkpoint that was made to be read, not to be continued."""
 
 
+class _Unusable(CheckpointError):
+    """A checkpoint that is not damaged and yet none of ours; found when it is half read, so no other one is tried."""
+
+
 class CheckpointStore:
     """The checkpoints of one run folder."""
 
@@ -134,7 +140,7 @@ class CheckpointStore:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
         try:
-            model, training, tree = _split(state, _MODEL_PREFIXES[acting_network])
+            model, training, tree = split(state, MODEL_PREFIXES[acting_network])
             files = {
                 _MODEL_FILE: safetensors.torch.save(model),
                 "training.safetensors": safetensors.torch.save(training),
@@ -238,7 +244,7 @@ class CheckpointStore:
         for path in self.paths():
             try:
                 return self._load_one(path, replays, tuple(damaged))
-            except _WeightsOnly:
+            except (_WeightsOnly, _Unusable):
                 raise
             except CheckpointError as error:
                 damaged.append(f"checkpoint {path.name} is damaged ({error})")
@@ -260,23 +266,25 @@ class CheckpointStore:
                 f"{path} holds weights only (a packed run), expected a run with its replay; it can be evaluated, "
                 "exported and profiled, but training needs a new run: --run NEW_FOLDER"
             )
-        model = _read_tensors(path, _MODEL_FILE, manifest)
-        training = _read_tensors(path, "training.safetensors", manifest)
-        tree = read_json(_read_file(path, "state.json", manifest), "state.json")
-        state = _join(tree, model, training, _MODEL_PREFIXES[manifest.get("acting_network", "online")])
-        contents = [self._read_segment(entry) for entry in manifest["segments"]]
-        require_saved(state, ("replays",), "the run")
-        require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
-        for entry, content in zip(manifest["segments"], contents, strict=True):
-            _require_segment(content, entry, replays)
-        # Nothing is changed before everything was read.
-        for task, replay in enumerate(replays):
-            replay.load_state_dict(state["replays"][str(task)])
-        for entry, content in zip(manifest["segments"], contents, strict=True):
-            replay = replays[entry["task"]]
-            segment = Segment(entry["lane"], entry["number"], complete=True)
-            frames = np.frombuffer(zstandard.decompress(content), replay.frame_dtype).reshape(-1, *replay.frame_shape)
-            replay.load_segment(segment, frames)
+        with fitting_state():
+            model = _read_tensors(path, _MODEL_FILE, manifest)
+            training = _read_tensors(path, "training.safetensors", manifest)
+            tree = read_json(_read_file(path, "state.json", manifest), "state.json")
+            state = join(tree, model, training, MODEL_PREFIXES[manifest.get("acting_network", "online")])
+            contents = [self._read_segment(entry) for entry in manifest["segments"]]
+            require_saved(state, ("replays", "steps"), "the run")
+            if state["steps"] != manifest["step"]:
+                raise CheckpointError(f"state.json is of step {shown(state['steps'])}, expected {manifest['step']}")
+            require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
+            for task, replay in enumerate(replays):
+                replay.require_fits(state["replays"][str(task)])
+            _require_segments(manifest["segments"], contents, replays, state["replays"])
+            # Nothing is changed before everything was read.
+            for task, replay in enumerate(replays):
+                replay.load_state_dict(state["replays"][str(task)])
+            for entry, content in zip(manifest["segments"], contents, strict=True):
+                replay, segment = replays[entry["task"]], Segment(entry["lane"], entry["number"], complete=True)
+                replay.load_segment(segment, _frames(entry, content, replay))  # one by one: they may be gigabytes
         complete = {(task, s.lane, s.number) for task, r in enumerate(replays) for s in r.segments() if s.complete}
         keyed = {(entry["task"], entry["lane"], entry["number"]): entry for entry in manifest["segments"]}
         self._stored = {key: entry for key, entry in keyed.items() if key in complete}
@@ -351,63 +359,55 @@ def _read_tensors(path: Path, name: str, manifest: dict[str, Any]) -> dict[str, 
     return tensors
 
 
-def _require_segment(content: bytes, entry: dict[str, Any], replays: list[FrameReplay]) -> None:
-    """Refuse a stored segment that no replay of the run has, or that declares more than a segment's size."""
+def _require_segments(
+    entries: list[dict[str, Any]], contents: list[bytes], replays: list[FrameReplay], states: dict[str, Any]
+) -> None:
+    """Refuse stored segments that are not just those that the replays' states refer to, or of another size.
+
+    Raises:
+        CheckpointError: naming the segment.
+    """
+    expected = {
+        (task, *key): frames
+        for task, replay in enumerate(replays)
+        for key, frames in replay.segments_of(states[str(task)]).items()
+    }
+    keys = [(entry["task"], entry["lane"], entry["number"]) for entry in entries]
+    if sorted(keys) != sorted(expected):
+        raise CheckpointError(f"its {len(keys)} replay segments are not the {len(expected)} that its state refers to")
+    for key, entry, content in zip(keys, entries, contents, strict=True):
+        number = f"replay segment {entry['sha256'][:12]}"
+        replay = replays[entry["task"]]
+        needed = expected[key] * math.prod(replay.frame_shape) * replay.frame_dtype.itemsize
+        try:
+            size = zstandard.frame_content_size(content)
+        except zstandard.ZstdError as error:
+            raise CheckpointError(f"{number} is not Zstandard") from error
+        if size != needed:
+            raise CheckpointError(f"{number} declares {size:,} bytes, expected {needed:,}")
+
+
+def _frames(entry: dict[str, Any], content: bytes, replay: FrameReplay) -> npt.NDArray[Any]:
+    """The frames of a stored segment whose checksum and declared size are right.
+
+    Raises:
+        _Unusable: it is no Zstandard all the same, or holds numbers that are not finite.
+    """
     number = f"replay segment {entry['sha256'][:12]}"
-    if entry["task"] >= len(replays) or entry["lane"] >= replays[entry["task"]].num_lanes:
-        raise CheckpointError(f"{number} is of task {entry['task']} and copy {entry['lane']}, which the run has not")
-    replay = replays[entry["task"]]
-    frame_bytes = math.prod(replay.frame_shape) * replay.frame_dtype.itemsize
     try:
-        size = zstandard.frame_content_size(content)
+        frames = np.frombuffer(zstandard.decompress(content), replay.frame_dtype).reshape(-1, *replay.frame_shape)
     except zstandard.ZstdError as error:
-        raise CheckpointError(f"{number} is not Zstandard") from error
-    if not 0 <= size <= SEGMENT_SLOTS * frame_bytes or size % frame_bytes:
-        raise CheckpointError(f"{number} declares {size:,} bytes, expected at most {SEGMENT_SLOTS:,} whole frames")
+        raise _Unusable(f"{number} is not Zstandard, expected frames; start a new run with --run") from error
+    if replay.frame_dtype.kind == "f" and not np.isfinite(frames).all():
+        raise _Unusable(f"{number} has a number that is not finite, expected finite frames; start a new run with --run")
+    return frames
 
 
-# A nested state <-> tensors by path and a JSON tree in which {"$tensor": path} stands for a tensor.
-
-_MODEL_PREFIXES = {"online": "learner/network/", "target": "learner/target/"}
-
-
-def _split(state: dict[str, Any], prefix: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], Any]:
-    tensors: dict[str, torch.Tensor] = {}
-
-    def walk(value: Any, path: str) -> Any:
-        if isinstance(value, torch.Tensor):
-            tensors[path] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
-            return {"$tensor": path}
-        if isinstance(value, np.ndarray):
-            tensors[path] = torch.from_numpy(np.ascontiguousarray(value).copy())
-            return {"$array": path}
-        if isinstance(value, dict):
-            return {str(key): walk(item, f"{path}/{key}" if path else str(key)) for key, item in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [walk(item, f"{path}/{index}") for index, item in enumerate(value)]
-        return value
-
-    tree = walk(state, "")
-    model = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-    training = {k: v for k, v in tensors.items() if not k.startswith(prefix)}
-    return model, training, tree
-
-
-def _join(tree: Any, model: dict[str, torch.Tensor], training: dict[str, torch.Tensor], prefix: str) -> Any:
-    def find(path: str) -> torch.Tensor:
-        source = model if path.startswith(prefix) else training
-        key = path.removeprefix(prefix)
-        if key not in source:
-            raise CheckpointError(f"tensor {path} is missing")
-        return source[key]
-
-    def walk(value: Any) -> Any:
-        if isinstance(value, dict):
-            if set(value) == {"$tensor"}:
-                return find(value["$tensor"])
-            if set(value) == {"$array"}:
-                return find(value["$array"]).numpy()
-            return {key: walk(item) for key, item in value.items()}
-        return [walk(item) for item in value] if isinstance(value, list) else value
-
-    return walk(tree)
+@contextmanager
+def fitting_state() -> Iterator[None]:
+    """Within it, what code raises about a state that is not one of its own is an error of one line."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CheckpointError(f"its state is not one that a run saves ({reason:.200})") from error

@@ -17,7 +17,7 @@ from typing import Any
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol
 from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.numbers import exact
-from switchmt_snn.errors import RunFolderError
+from switchmt_snn.errors import ConfigError, RunFolderError, printable
 from switchmt_snn.runs.files import file_name, json_text, write_atomically
 
 CLEARLY_ABOVE = 1.96
@@ -119,17 +119,40 @@ def _step_name(step: int) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
+        if not path.is_file():
+            raise ValueError("it is no plain file")
         stored = dict(json.loads(path.read_bytes()))
         stored = {
-            "step": int(stored["step"]),
+            "step": _count(stored["step"]),
             "protocol": dict(stored["protocol"]),
             "tasks": [dict(row) for row in stored["tasks"]],
         }
+        str(EvaluationProtocol.from_dict(stored["protocol"]))
         for row in stored["tasks"]:
-            row["mean"] = math.nan if row["mean"] is None else float(row["mean"])  # JSON has no NaN
-            _ = row["policy"], row["task"], row["episodes"], float(row["mean_length_steps"])
-    except (ValueError, KeyError, TypeError) as error:
+            row["mean"] = math.nan if row["mean"] is None else _number(row["mean"])  # JSON has no NaN
+            row["mean_length_steps"] = _number(row["mean_length_steps"])
+            row["episodes"] = _count(row["episodes"])
+            for key in ("median", "standard_error", "human_normalized", "mean_q"):  # some are not in older files
+                row[key] = None if row.get(key) is None else _number(row[key])
+            if not all(isinstance(row[key], str) and row[key].isprintable() for key in ("policy", "task")):
+                raise ValueError("a policy or a task is no printable text")
+    except (
+        ArithmeticError, AttributeError, ConfigError, KeyError, OSError, RecursionError, TypeError, ValueError
+    ) as error:  # fmt: skip
         raise RunFolderError(
-            f"{path} cannot be read ({error!s:.80}), expected an evaluation; delete it, or evaluate again"
+            f"{path} cannot be read ({printable(str(error)):.80}), expected an evaluation; delete it, or evaluate again"
         ) from error
     return stored
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{value!s:.40} is not a finite number")
+    return number
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or int(value) != value or not 0 <= value < 2**62:
+        raise ValueError(f"{value!s:.40} is not a whole number from 0")
+    return int(value)

@@ -19,6 +19,7 @@ import filelock
 
 from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
+from switchmt_snn.config.bounds import LARGEST
 from switchmt_snn.errors import ConfigError, RunFolderError, nearest
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
@@ -69,9 +70,25 @@ def latest_run() -> Path:
 def _begun(path: Path) -> datetime | None:
     """When a run was begun; None if the file is not of a run."""
     try:
-        return datetime.fromisoformat(json.loads(path.read_bytes())["created"]).astimezone()
-    except (OSError, ValueError, KeyError, TypeError):
+        return datetime.fromisoformat(read_environment(path.parent)["created"]).astimezone()
+    except (RunFolderError, ValueError, KeyError, TypeError, OverflowError):
         return None
+
+
+def read_environment(run: Path) -> dict[str, Any]:
+    """The content of a run's environment.json.
+
+    Raises:
+        RunFolderError: it is missing, or no JSON of a run.
+    """
+    path = run / "environment.json"
+    try:
+        facts = json.loads(path.read_bytes()) if path.is_file() else None
+    except (OSError, ValueError, RecursionError):
+        facts = None
+    if not isinstance(facts, dict):
+        raise RunFolderError(f"{path} cannot be read, expected the JSON that training wrote; restore the file")
+    return facts
 
 
 BEFORE = {"tasks": {"image_layout": "channels_last"}}
@@ -89,10 +106,9 @@ class RunFolder:
     def is_run(self) -> bool:
         """Whether a run of this program lives here."""
         try:
-            facts = json.loads((self.path / "environment.json").read_bytes())
-        except (OSError, ValueError):
+            return bool(read_environment(self.path).get("program") == "switchmt-snn")
+        except RunFolderError:
             return False
-        return isinstance(facts, dict) and facts.get("program") == "switchmt-snn"
 
     @property
     def _is_free(self) -> bool:
@@ -144,8 +160,8 @@ class RunFolder:
 
     def threads(self) -> int | None:
         """The threads of PyTorch with which the run began; None if it does not say."""
-        threads = json.loads((self.path / "environment.json").read_bytes()).get("torch_threads")
-        return threads if isinstance(threads, int) else None
+        threads = read_environment(self.path).get("torch_threads")
+        return threads if type(threads) is int and 1 <= threads <= LARGEST["threads"] else None
 
     def config(self) -> ExperimentConfig:
         """The run's resolved config."""

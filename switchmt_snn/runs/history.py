@@ -12,11 +12,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from switchmt_snn.errors import RunFolderError
+from switchmt_snn.errors import RunFolderError, printable
 from switchmt_snn.learning.events import EpisodeEnded, LayerHealth, Measured
 from switchmt_snn.learning.switching import DECISION_COLUMNS
 
 _T = TypeVar("_T")
+_MOST = 2**62
+_PEAKS = {"process": "peak_memory_bytes", "device": "peak_device_memory_bytes"}
 
 
 @dataclass(frozen=True)
@@ -97,38 +99,36 @@ def read_history(folder: Path, task_names: tuple[str, ...]) -> History:
 
     def episode(row: dict[str, str]) -> tuple[EpisodeEnded, Clocked]:
         ended = EpisodeEnded(
-            step=int(row["step"]),
+            step=_count(row["step"]),
             task=task_names.index(row["task"]),
-            episode=int(row["episode"]),
-            episode_return=float(row["return"]),
-            length_steps=int(row["length_steps"]),
+            episode=_count(row["episode"]),
+            episode_return=_finite(row["return"]),
+            length_steps=_count(row["length_steps"]),
             truncated=row["truncated"] == "1",
-            epsilon=float(row["epsilon"]),
-            updates=int(row["updates"]),
+            epsilon=_finite(row["epsilon"]),
+            updates=_count(row["updates"]),
         )
-        return ended, Clocked(ended.step, float(row["wall_s"]))
+        return ended, Clocked(ended.step, _finite(row["wall_s"]))
 
-    def measurement(line: str) -> tuple[Measured, Clocked, dict[str, Any]]:
+    def measurement(line: str) -> tuple[Measured, Clocked, dict[str, int]]:
         row = dict(json.loads(line))
         measured = Measured(
-            step=int(row["step"]),
+            step=_count(row["step"]),
             task=task_names.index(row["task"]),
-            updates=int(row["updates"]),
+            updates=_count(row["updates"]),
             loss=_number(row["loss"]),
             q=_number(row["q"]),
-            steps_by_task=tuple(int(row["steps_by_task"].get(task, 0)) for task in task_names),
-            layers={name: _health(layer) for name, layer in row["layers"].items()},
+            steps_by_task=tuple(_count(row["steps_by_task"].get(task, 0)) for task in task_names),
+            layers={_layer(name): _health(layer) for name, layer in row["layers"].items()},
         )
-        return measured, Clocked(measured.step, float(row["wall_s"])), row
+        peaks = {key: _count(row[key]) for key in _PEAKS.values() if row.get(key) is not None}
+        return measured, Clocked(measured.step, _finite(row["wall_s"])), peaks
 
     episodes = _table(folder / "episodes.csv", episode)
-    decisions = _table(folder / "switches.csv", _decision)
+    decisions = _table(folder / "switches.csv", lambda row: _decision(row, task_names))
     rows = list(_parsed(folder / "metrics.jsonl", enumerate(_whole_lines(folder / "metrics.jsonl"), 1), measurement))
     clock = sorted([one for _, one in episodes] + [one for _, one, _ in rows], key=lambda one: one.step)
-    peaks = {
-        name: max((int(row[key]) for _, _, row in rows if row.get(key) is not None), default=None)
-        for name, key in (("process", "peak_memory_bytes"), ("device", "peak_device_memory_bytes"))
-    }
+    peaks = {name: max((row[key] for _, _, row in rows if key in row), default=None) for name, key in _PEAKS.items()}
     return History(
         task_names=task_names,
         episodes=tuple(one for one, _ in episodes),
@@ -139,14 +139,21 @@ def read_history(folder: Path, task_names: tuple[str, ...]) -> History:
     )
 
 
-def _decision(row: dict[str, str]) -> Decision:
+def _decision(row: dict[str, str], task_names: tuple[str, ...]) -> Decision:
     texts = ("step", "visit", "task", "decision", "next_task", "reason")
     numbers = {name: float(value) for name, value in row.items() if name not in texts and value}
     if row["decision"] not in ("stay", "switch"):
         raise ValueError(f"decision is {row['decision']!r}")
+    for name in (row["task"], *([row["next_task"]] if row["decision"] == "switch" else [])):
+        if name not in task_names:
+            raise ValueError(f"{name!r} is no task of the run")
+    for name in ("episodes_in_visit", "steps_in_visit"):
+        _count(numbers[name])
+    if not row["reason"].isprintable() or not all(name.isprintable() for name in numbers):
+        raise ValueError("a reason or a column is no printable text")
     return Decision(
-        step=int(row["step"]),
-        visit=int(row["visit"]),
+        step=_count(row["step"]),
+        visit=_count(row["visit"]),
         task=row["task"],
         switches=row["decision"] == "switch",
         next_task=row["next_task"],
@@ -161,45 +168,77 @@ def policy_columns(history: History) -> tuple[str, ...]:
     return tuple(name for name in names if name not in DECISION_COLUMNS)
 
 
+def _count(value: Any) -> int:
+    """A number of steps, episodes or bytes.
+
+    Raises:
+        ValueError: it is none.
+    """
+    count = int(value)
+    if not 0 <= count < _MOST:
+        raise ValueError(f"{value!s:.40} is not a number from 0")
+    return count
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number) or abs(number) > _MOST:
+        raise ValueError(f"{value!s:.40} is not a finite number")
+    return number
+
+
 def _number(value: Any) -> float | None:
-    return None if value is None else float(value)
+    return None if value is None else _finite(value)
+
+
+def _layer(name: str) -> str:
+    if not name.isprintable() or len(name) > 200:
+        raise ValueError("a layer's name is no printable text")
+    return name
 
 
 def _health(layer: dict[str, Any]) -> LayerHealth:
     return LayerHealth(
-        *(math.nan if layer[key] is None else float(layer[key]) for key in ("rate", "dead", "saturated"))
+        *(math.nan if layer[key] is None else _finite(layer[key]) for key in ("rate", "dead", "saturated"))
     )
 
 
 def _table(path: Path, parse: Callable[[dict[str, str]], _T]) -> list[_T]:
     lines = _whole_lines(path)
-    header = next(csv.reader(lines[:1]), [])
 
     def numbered() -> Iterator[tuple[int, dict[str, str]]]:
-        reader = csv.DictReader(lines[1:], header)
+        reader = csv.DictReader(lines)
         for row in reader:
-            yield reader.line_num + 1, row
+            yield reader.line_num, row
 
-    return list(_parsed(path, numbered(), parse))
+    try:
+        return list(_parsed(path, numbered(), parse))
+    except csv.Error as error:
+        raise RunFolderError(
+            f"{path} is no table ({error}), expected a log of a run; restore it from a copy"
+        ) from error
 
 
 def _parsed(path: Path, rows: Iterator[tuple[int, Any]], parse: Callable[[Any], _T]) -> Iterator[_T]:
     for number, row in rows:
         try:
             yield parse(row)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise RunFolderError(
-                f"{path} line {number} cannot be read ({error!s:.80}), expected a line as training writes it; restore "
-                "the file from a copy, or delete the line"
+                f"{path} line {number} cannot be read ({printable(str(error)):.80}), expected a line as training "
+                "writes it; restore the file from a copy, or delete the line"
             ) from error
 
 
 def _whole_lines(path: Path) -> Sequence[str]:
     """The lines that have their end."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+    if not path.exists():
         return []
-    except UnicodeDecodeError as error:
-        raise RunFolderError(f"{path} is no text, expected a log of a run; restore it from a copy") from error
+    try:
+        if not path.is_file():
+            raise OSError("it is no plain file")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = "it is no text" if isinstance(error, UnicodeDecodeError) else error.strerror or error
+        raise RunFolderError(f"{path} cannot be read ({reason}), expected a log; restore it from a copy") from error
     return text[: text.rfind("\n") + 1].splitlines()

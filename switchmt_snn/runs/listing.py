@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,7 +10,7 @@ from typing import Any
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import RunFolderError, SwitchMTError
-from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, read_history
 
 RETURN_WINDOW_EPISODES = 20
@@ -135,9 +134,9 @@ def when_begun(path: Path) -> str:
         RunFolderError: its environment.json does not say.
     """
     try:
-        created = str(json.loads((path / "environment.json").read_bytes())["created"])
-        datetime.fromisoformat(created)
-    except (KeyError, ValueError) as error:
+        created = str(read_environment(path)["created"])
+        datetime.fromisoformat(created).astimezone()
+    except (KeyError, ValueError, OverflowError) as error:
         raise RunFolderError(
             f"{path / 'environment.json'} does not say when the run began, expected its key created; restore the file"
         ) from error

@@ -13,7 +13,7 @@ from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig
 from switchmt_snn.drawing.numbers import bytes_of, digits, duration, percent, whole
 from switchmt_snn.runs.evaluations import better_than_random
 from switchmt_snn.runs.files import sha256
-from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, read_history
 
 CARD = "MODEL_CARD.md"
@@ -39,7 +39,7 @@ def model_card(
     """
     config = run.config()
     step, weights, _ = run.checkpoints().load_model(checkpoint)
-    environment = json.loads((run.path / "environment.json").read_bytes())
+    environment = read_environment(run.path)
     history = read_history(run.path, config.tasks.names)
     scores = _scores(run, step)
     profile = _profile(run, step)

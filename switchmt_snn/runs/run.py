@@ -23,7 +23,7 @@ from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
-from switchmt_snn.runs.checkpoint import fitting_weights
+from switchmt_snn.runs.checkpoint import fitting_state, fitting_weights
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
 from switchmt_snn.runs.logs import RunLogs
@@ -253,7 +253,7 @@ class _Driver:
         if not self.store.paths():
             return None, None, []
         loaded = self.store.load(self.training.replays)
-        with fitting_weights():
+        with fitting_weights(), fitting_state():
             self.training.load_state_dict(loaded.state)
         notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]
         environment = describe_environment(self.config, self.training.learner.device)

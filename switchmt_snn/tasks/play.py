@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.errors import CheckpointError, require_saved
+from switchmt_snn.errors import CheckpointError, require_saved, shown
 from switchmt_snn.tasks.contract import CheckedEnvironment
 from switchmt_snn.tasks.suite import Frames, Picture, TaskSuite, VectorStep
 
@@ -106,7 +106,7 @@ class Play:
         stored = len(state["seeds"]), len(state["actions"])
         if state["task"] != self.task:
             raise CheckpointError(
-                f"the checkpoint has episodes of task {state['task']!r}, expected some of task {self.task}; start "
+                f"the checkpoint has episodes of task {shown(state['task'])}, expected some of task {self.task}; start "
                 "a new run with --run"
             )
         if stored != (self.num_envs, self.num_envs):

@@ -6,8 +6,11 @@ A reader takes a mutant or refuses it by one printable line (``SwitchMTError``),
 from __future__ import annotations
 
 import functools
+import io
 import json
+import random
 import resource
+import shutil
 import signal
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,20 +18,40 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from switchmt_snn.config import TasksConfig, load_config, resolve, to_yaml
+import numpy as np
+import safetensors.numpy
+import torch
+import zstandard
+
+from switchmt_snn.config import ExperimentConfig, TasksConfig, load_config, resolve, to_yaml
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.export.chips.fit import check_fit
+from switchmt_snn.export.recording import read_recording
 from switchmt_snn.export.selection import Selection
-from switchmt_snn.learning.training import observation_spec
-from switchmt_snn.runs.checkpoint import CheckpointStore, fitting_weights
+from switchmt_snn.learning.events import Stepped
+from switchmt_snn.learning.training import Training, observation_spec
+from switchmt_snn.runs.checkpoint import CheckpointStore, fitting_state, fitting_weights
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.files import file_name, sha256
+from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.listing import list_runs, summarize
 from switchmt_snn.runs.manifest import seal
 from switchmt_snn.spiking.network import QNetwork, build_network
 from switchmt_snn.study.grid import load_study
+from switchmt_snn.study.replayed import replay_policies
 from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.viewing.report.page import write_report
 from tests.export.chip_networks import chain
-from tests.fuzz.mutations import binary_mutant, json_mutant, mutant, text_mutant
+from tests.fuzz.exported import nir_mutant, nir_seeds, onnx_mutant, onnx_seeds, read_nir_file, read_onnx
+from tests.fuzz.mutations import (
+    TEXT_CHANGES,
+    array_mutant,
+    binary_mutant,
+    change_value,
+    json_mutant,
+    mutant,
+    text_mutant,
+)
 
 ROOT = Path(__file__).parents[2]
 MOST_CPU_S = 10.0
@@ -207,12 +230,173 @@ def _read_weights(folder: Path, content: bytes, number: int) -> None:
     _read_checkpoint(folder, json.dumps({**manifest, "seal": seal(manifest)}).encode(), content)
 
 
+@functools.cache
+def _gym_run() -> ExperimentConfig:
+    return resolve(load_config(ROOT / "tests/fixtures/runs/gym/config.yaml"))
+
+
+def _continue(folder: Path, changed: str, content: bytes) -> None:
+    """Continue the stored run with one of its files changed and all checksums made to fit, for a few steps."""
+    source = CHECKPOINTS["gym"]
+    checkpoint, replay = folder / source.name, folder / "replay"
+    for made in (checkpoint, replay):
+        made.mkdir(exist_ok=True)
+    manifest = json.loads((source / "manifest.json").read_bytes())
+    del manifest["seal"]
+    for entry in manifest["segments"]:
+        name = f"{entry['sha256']}.zst"
+        whole = (source.parent / "replay" / name).read_bytes()
+        if name == changed:
+            whole, entry["sha256"] = content, sha256(content)
+        (replay / f"{entry['sha256']}.zst").write_bytes(whole)
+    for name in manifest["files"]:
+        whole = content if name == changed else (source / name).read_bytes()
+        manifest["files"][name] = sha256(whole)
+        (checkpoint / name).write_bytes(whole)
+    (checkpoint / "manifest.json").write_text(json.dumps({**manifest, "seal": seal(manifest)}))
+    suite = make_suite(_gym_run().tasks)
+    training = Training(_gym_run(), suite, torch.device("cpu"))
+    try:
+        loaded = CheckpointStore(folder).load(training.replays)
+        with fitting_weights(), fitting_state():
+            training.load_state_dict(loaded.state)
+        for event in training.events():
+            if isinstance(event, Stepped) and event.step > loaded.step + 12:
+                break
+        training.check_finite()
+    finally:
+        training.close()
+        shutil.rmtree(replay)
+
+
+def _read_state(folder: Path, content: bytes, number: int) -> None:
+    _continue(folder, "state.json", content)
+
+
+def _read_training(folder: Path, content: bytes, number: int) -> None:
+    _continue(folder, "training.safetensors", content)
+
+
+SEGMENT = min(ROOT.glob("tests/fixtures/runs/gym/checkpoints/replay/*.zst"))
+
+
+def _read_segment(folder: Path, content: bytes, number: int) -> None:
+    _continue(folder, SEGMENT.name, content)
+
+
+def _segment_mutant(good: bytes, seed: int) -> bytes:
+    """Frames of any kind that are whole, or damaged bytes."""
+    rng = random.Random(seed)
+    if rng.random() < 0.5:
+        return binary_mutant(good, seed)
+    return zstandard.compress(binary_mutant(zstandard.decompress(good), seed))
+
+
+STORED_RUN = ROOT / "tests/fixtures/runs/gym"
+REPORTED = 8
+"""One of so many mutants of a log also makes the run's page."""
+
+
+def _read_log(changed: str) -> Callable[[Path, bytes, int], None]:
+    """A reader of one log of a run: as runs, replay-policies and report read it."""
+
+    def read(folder: Path, content: bytes, number: int) -> None:
+        run = folder / "run"
+        if not run.exists():
+            shutil.copytree(STORED_RUN, run, ignore=shutil.ignore_patterns("recordings", "export", "replay"))
+        path = run / changed
+        good = path.read_bytes()
+        path.write_bytes(content)
+        try:
+            listed, damaged = list_runs(folder)
+            assert len(listed) + len(damaged) == 1
+            summarize(run)
+            replay_policies(RunFolder(run)).to_dict()
+            if number % REPORTED == 0:
+                write_report([run])
+        finally:
+            path.write_bytes(good)
+
+    return read
+
+
+def _line_mutant(good: bytes, seed: int) -> bytes:
+    """A mutant of a file of lines: of its values, its lines or its bytes."""
+    rng = random.Random(seed)
+    content = good
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        content = rng.choice((change_value, change_value, change_value, *TEXT_CHANGES))(content, rng)
+    return content
+
+
+EVALUATION = "evaluations/step-000000000400_Acrobot-v1+CartPole-v1_n2_seed10000.json"
+
+
+def _read_recording(folder: Path, content: bytes, number: int) -> None:
+    """Recorded play, as export and profile read it."""
+    path = folder / "mutant-step-400.npz"
+    path.write_bytes(content)
+    suite = make_suite(_gym_run().tasks)
+    recording = read_recording(path, "CartPole-v1", suite)
+    assert np.isfinite(recording.observations).all()
+    assert set(recording.actions.tolist()) <= {0, 1}
+
+
+def _npz_mutant(good: bytes, seed: int) -> bytes:
+    """An archive with other arrays, or with damaged bytes."""
+    rng = random.Random(seed)
+    if rng.random() < 0.4:
+        return binary_mutant(good, seed)
+    with np.load(io.BytesIO(good)) as archive:
+        arrays = dict(archive)
+    name = rng.choice(sorted(arrays))
+    arrays[name] = array_mutant(arrays[name], rng)
+    if arrays[name] is None:
+        del arrays[name]
+    content = io.BytesIO()
+    rng.choice((np.savez, np.savez_compressed))(content, **arrays)
+    return binary_mutant(content.getvalue(), seed) if rng.random() < 0.2 else content.getvalue()
+
+
+def _tensors_mutant(good: bytes, seed: int) -> bytes:
+    """Tensors of other shapes, types, names or values, or damaged bytes."""
+    rng = random.Random(seed)
+    if rng.random() < 0.2:
+        return binary_mutant(good, seed)
+    tensors = safetensors.numpy.load(good)
+    for name in rng.sample(sorted(tensors), rng.choice((1, 1, 2))):
+        changed = array_mutant(tensors[name], rng)
+        if changed is None or changed.dtype.kind not in "biuf":
+            del tensors[name]
+        else:
+            tensors[name] = np.ascontiguousarray(changed)
+    return safetensors.numpy.save(tensors)
+
+
 FORMATS = {
     "config": Format(_files("configs/*.yaml", "tests/fixtures/runs/*/config.yaml", "examples/*.yaml"), _read_config),
     "study": Format({**_files("configs/studies/*.yaml"), "grid": GRID}, _read_study),
     "target": Format(_files("export/energy/targets/*.yaml", "export/chips/builtin/*.yaml"), _read_target),
     "manifest": Format({"gym": (CHECKPOINTS["gym"] / "manifest.json").read_bytes()}, _read_manifest, json_mutant),
     "weights": Format({"gym": (CHECKPOINTS["gym"] / "model.safetensors").read_bytes()}, _read_weights, binary_mutant),
+    "state": Format({"gym": (CHECKPOINTS["gym"] / "state.json").read_bytes()}, _read_state, json_mutant),
+    "training": Format(
+        {"gym": (CHECKPOINTS["gym"] / "training.safetensors").read_bytes()}, _read_training, _tensors_mutant
+    ),
+    **{
+        name: Format({"gym": (STORED_RUN / file).read_bytes()}, _read_log(file), _line_mutant)
+        for name, file in (
+            ("episodes", "episodes.csv"),
+            ("switches", "switches.csv"),
+            ("metrics", "metrics.jsonl"),
+            ("environment", "environment.json"),
+        )
+    },
+    "evaluation": Format({"gym": (STORED_RUN / EVALUATION).read_bytes()}, _read_log(EVALUATION), json_mutant),
+    "onnx": Format(onnx_seeds(), read_onnx, onnx_mutant),
+    "nir": Format(nir_seeds(), read_nir_file, nir_mutant),
+    "recording": Format(_files("tests/fixtures/runs/gym/recordings/CartPole*.npz"), _read_recording, _npz_mutant),
+    "segment": Format({"gym": SEGMENT.read_bytes()}, _read_segment, _segment_mutant),
     "task-id": Format({name: name.encode() for name in TASK_IDS}, _read_task_id, _task_id_mutant),
 }
 

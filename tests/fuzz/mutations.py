@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import struct
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import yaml
 
 HOSTILE_WORDS = (
@@ -76,6 +78,38 @@ def binary_mutant(good: bytes, seed: int) -> bytes:
     for _ in range(rng.choice((1, 1, 2, 3))):
         content = rng.choice((_flip, _flip, _delete, _repeat, _truncate, _insert, _poke, _poke))(content, rng)
     return content
+
+
+def change_value(content: bytes, rng: random.Random) -> bytes:
+    """Another value between two commas or colons of a line."""
+    lines = content.split(b"\n")
+    index = rng.randrange(len(lines))
+    parts = re.split(rb"([,:])", lines[index])
+    parts[rng.randrange((len(parts) + 1) // 2) * 2] = rng.choice((*HOSTILE_WORDS, b"-1", b"nan", b"inf", b"1e308", b""))
+    lines[index] = b"".join(parts)
+    return b"\n".join(lines)
+
+
+def array_mutant(good: np.ndarray[Any, Any], rng: random.Random) -> np.ndarray[Any, Any] | None:
+    """Another shape, type or value of an array; None leaves it out."""
+    change = rng.randrange(7)
+    if change == 0:
+        return None
+    if change == 1:
+        return good.reshape(-1)
+    if change == 2:
+        return good[None]
+    if change == 3:
+        return np.repeat(np.atleast_1d(good), rng.choice((0, 2)), axis=0)
+    if change == 4:
+        with np.errstate(all="ignore"):
+            return good.astype(rng.choice(("u1", "i1", "i8", "f2", "f4", "f8", "?", "S3", "U2")))
+    changed = np.atleast_1d(good).copy()
+    extreme = (-1, 0, 1, 2**31, -(2**62), 2**62) if good.dtype.kind in "iub" else (np.nan, np.inf, -1e38, 1e38, -0.5)
+    with np.errstate(all="ignore"):
+        value = np.asarray(rng.choice(extreme)).astype(good.dtype)
+    changed.reshape(-1)[rng.randrange(max(changed.size, 1)) if change == 5 and changed.size else slice(None)] = value
+    return changed.reshape(good.shape)
 
 
 def _poke(content: bytes, rng: random.Random) -> bytes:
@@ -169,3 +203,5 @@ _CHANGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
     _flip, _delete, _repeat, _truncate, _insert, _replace_value, _replace_value, _repeat_line, _encode,
     _change_content, _change_content, _change_content, _change_content, _change_content,
 )  # fmt: skip
+TEXT_CHANGES = (_flip, _delete, _repeat, _truncate, _insert, _repeat_line, _encode)
+"""Changes of any text."""

@@ -14,7 +14,6 @@ import zstandard
 from switchmt_snn.config import load_config, resolve
 from switchmt_snn.errors import CheckpointError
 from switchmt_snn.learning.training import make_replay
-from switchmt_snn.replay.ring import SEGMENT_SLOTS
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.files import sha256
 from switchmt_snn.runs.manifest import seal
@@ -44,12 +43,12 @@ def changed(folder: Path, content: bytes | None, **entry: Any) -> CheckpointStor
         (
             zstandard.compress(bytes(2**26)),
             {},
-            f"declares 67,108,864 bytes, expected at most {SEGMENT_SLOTS:,} whole frames",
+            "declares 67,108,864 bytes, expected 2,568",
         ),
         (zstandard.compress(bytes(7)), {}, "declares 7 bytes"),
         (b"no frame", {}, "is not Zstandard"),
-        (None, {"task": 9}, "is of task 9 and copy 0, which the run has not"),
-        (None, {"lane": 99}, "is of task 0 and copy 99, which the run has not"),
+        (None, {"task": 9}, "its 4 replay segments are not the 4 that its state refers to"),
+        (None, {"lane": 99}, "its 4 replay segments are not the 4"),
     ],
 )
 def test_segments_are_refused_before_a_replay_changes(

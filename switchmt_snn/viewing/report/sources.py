@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +11,7 @@ from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.learning.events import EpisodeEnded
 from switchmt_snn.learning.switching.criterion import Deciding, criterion_class
-from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, policy_columns, read_history
 from switchmt_snn.runs.listing import RunSummary, summary_of, when_begun
 from switchmt_snn.tasks.registry import find_suite
@@ -80,7 +79,7 @@ def read_sources(path: Path) -> Sources:
     return Sources(
         folder=folder,
         config=config,
-        environment=json.loads((path / "environment.json").read_bytes()),
+        environment=read_environment(path),
         summary=summary_of(folder, config, when_begun(path), history, evaluations),
         history=history,
         evaluations=evaluations,
