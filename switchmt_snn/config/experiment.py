@@ -34,6 +34,9 @@ class ExperimentConfig:
     """Where the network runs; auto takes cuda, else mps, else cpu."""
     threads: int | None = None
     """CPU threads of torch; null leaves torch's choice. A run that is continued keeps the number that it began with."""
+    initial_weights: str | None = None
+    """A run folder or pretrained/NAME of the same tasks and network: a new run begins with its last weights; null takes
+    those of the seed. Replay, optimizer, epsilon and counters begin anew."""
     tasks: TasksConfig = field(default_factory=TasksConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)

@@ -26,6 +26,7 @@ from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_state, fitting_weights
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
+from switchmt_snn.runs.initial_weights import InitialWeights, read_initial_weights
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.plan import decide, plan
@@ -136,20 +137,26 @@ def _train(
     if threads is not None:
         torch.set_num_threads(threads)
     keep_freed_memory()
+    has_checkpoint = folder is not None and stored is not None and bool(folder.checkpoints().paths())
+    begun = folder.path if folder is not None and stored is not None else None
+    initial = None if has_checkpoint else read_initial_weights(planned.config, planned.suite, begun)
     if folder is None:
         folder = claim_new_run(config.name)
     lock = folder.lock()
     try:
         folder.require_unchanged(stored is not None)
         if stored is None:
-            folder.create(planned.config, describe_environment(planned.config, planned.device), config)
+            environment = describe_environment(planned.config, planned.device)
+            if initial is not None:
+                environment["initial_weights"] = initial.facts()
+            folder.create(planned.config, environment, config)
         elif stored != planned.config:
             folder.save_config(planned.config)
         if group is not None:
             group.share(to_dict(planned.config))
         training = Training(planned.config, planned.suite, planned.device, group)
         try:
-            return _Driver(folder, training, observers, planned.notes).run()
+            return _Driver(folder, training, observers, planned.notes, initial).run()
         finally:
             training.close()
     finally:
@@ -185,9 +192,14 @@ class _Driver:
     """One call's worth of a run: feeds observers, saves, evaluates, stops."""
 
     def __init__(
-        self, folder: RunFolder, training: Training, observers: Sequence[Observer], notes: Sequence[str]
+        self,
+        folder: RunFolder,
+        training: Training,
+        observers: Sequence[Observer],
+        notes: Sequence[str],
+        initial: InitialWeights | None,
     ) -> None:
-        self.notes = notes
+        self.notes, self.initial = notes, initial
         self.folder, self.training, self.observers = folder, training, observers
         self.config = training.config
         self.store = folder.checkpoints(self.config.recording.keep_checkpoints)
@@ -251,7 +263,10 @@ class _Driver:
     def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
         """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""
         if not self.store.paths():
-            return None, None, []
+            if self.initial is None:
+                return None, None, []
+            self.initial.give(self.training.learner)
+            return None, None, [f"begins with the weights of {self.initial.run} after {self.initial.step:,} steps"]
         loaded = self.store.load(self.training.replays)
         with fitting_weights(), fitting_state():
             self.training.load_state_dict(loaded.state)
