@@ -1,10 +1,12 @@
 """Whether each command works with environments that nobody here wrote, or refuses them in one line.
 
-``python -m benchmarks.public_environments ID ... [--out FILE]``, in an interpreter in which the environments are
-installed; an ID is Gymnasium's, or module:ID where a module must be imported first. Each ID goes through ``check-env``,
-``train``, ``evaluate``, ``export`` and ``profile``, a few hundred steps each: this says that they run, not that
-something was learned. Where a refusal names one of Gymnasium's wrappers, the ID is tried again with it. What
-happened is added to FILE (results/environments/environments.json), and README.md beside it is made of that.
+``python -m benchmarks.public_environments ID ... [--wrappers NAME ...] [--out FILE]``, in an interpreter in which the
+environments are installed; an ID is Gymnasium's, or module:ID where a module must be imported first (the modules of
+examples/ are found, too). Each ID goes through ``check-env``, ``train``, ``evaluate``, ``export`` and ``profile``, a
+few hundred steps each: this says that they run, not that something was learned. Where a refusal names a wrapper (one of
+``tasks.wrappers``, or one of the environment's package), the ID is tried again with it; ``--wrappers`` takes the place
+of what refusals name. What happened is added to FILE (results/environments/environments.json), and README.md beside it
+is made of that.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from typing import Any
 from benchmarks.measure import environment
 
 OUT = Path(__file__).parents[1] / "results" / "environments" / "environments.json"
+EXAMPLES = Path(__file__).parents[1] / "examples"
 LONGEST_S = 240
 STEPS = 600
 DECISIONS = 100
@@ -43,11 +46,15 @@ PACKAGES = {
     "highway_env": "highway-env",
 }
 """Distributions of modules."""
+BOX2D = ("LunarLander", "BipedalWalker", "CarRacing")
+"""Gymnasium's ids that need the package box2d."""
 
 
 def command(words: list[str], folder: str) -> dict[str, Any]:
     """Run a command: its exit code, and the last line that it wrote where it did not end with 0."""
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}
+    paths = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(EXAMPLES))))
+    env = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    env |= {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}
     whole = [sys.executable, "-m", "switchmt_snn", *words]
     try:
         done = subprocess.run(whole, capture_output=True, text=True, timeout=LONGEST_S, env=env, cwd=folder)
@@ -85,9 +92,20 @@ def tried(name: str, wrappers: tuple[str, ...] = ()) -> dict[str, Any]:
     return found
 
 
+def named_wrapper(name: str, result: dict[str, Any]) -> str | None:
+    """The wrapper that a refusal tells the user to set, if it can be set as it is named."""
+    said = result["last_line"] or ""
+    named = re.search(r"tasks\.wrappers=\[(?:[^]]*,)?(\w+)\]", said) or re.search(r"such as ([\w.]+:\w+)", said)
+    if named is None or (":" in named[1] and named[1].partition(".")[0] != name.partition(":")[0]):
+        return None
+    return named[1]
+
+
 def versions(names: list[str]) -> dict[str, str]:
     """Of the packages that the environments come from."""
     packages = {"gymnasium"} | {PACKAGES[module] for name in names if (module := name.partition(":")[0]) in PACKAGES}
+    if any(name.startswith(BOX2D) for name in names):
+        packages.add("box2d")
     return {package: importlib.metadata.version(package) for package in sorted(packages)}
 
 
@@ -122,14 +140,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ids", nargs="+")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--wrappers", nargs="+", default=())
     options = parser.parse_args()
     for name in options.ids:
         results = [tried(name)]
-        for result in results[0]["commands"].values():
-            named = re.search(r"tasks\.wrappers=\[(\w+)\]", result["last_line"] or "")
-            if named is not None:
-                results.append(tried(name, (named[1],)))
-                break
+        named: str | None = None
+        wrappers: tuple[str, ...] = tuple(options.wrappers)
+        if not wrappers and (named := named_wrapper(name, results[0]["commands"]["check-env"])) is not None:
+            wrappers = (named,)
+        while wrappers:
+            results.append(tried(name, wrappers))
+            named = named_wrapper(name, results[-1]["commands"]["check-env"])  # actions, after observations
+            wrappers = (*wrappers, named) if named is not None and named not in wrappers else ()
         stored = json.loads(options.out.read_text()) if options.out.exists() else {"tried": []}
         stored["tried"] = [one for one in stored["tried"] if one["id"] != name]
         stored["tried"] += [{**one, "versions": versions([name])} for one in results]

@@ -109,7 +109,7 @@ def export(
     if (settings.tasks or settings.unroll) and settings.nir and not settings.onnx:
         option, file = ("--task", "decision_TASK.onnx") if settings.tasks else ("--unroll", "unrolled.onnx")
         raise ConfigError(f"{option} writes {file}, expected --onnx with it (--nir writes every task); add --onnx")
-    run_folder = open_run(run, to_write=True)
+    run_folder = open_run(run)
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     specialised = tuple(agent.suite.names[agent.suite.index(task)] for task in settings.tasks)
     network = fold_agent(agent)
@@ -118,6 +118,7 @@ def export(
     built = _built(exported, settings, specialised)
     for name, reason in built.left_out.items():
         note(f"left out {name.upper()}: {reason}")
+    run_folder = open_run(run_folder.path, to_write=True)
     folder = _made(Path(out) if out is not None else run_folder.path / "export")
     facts = provenance(run_folder.path) | {"weights": "int8" if settings.int8 else "float32"}
     for name in ("parity.json", CARD):  # of the files that are replaced now
@@ -270,7 +271,7 @@ def evaluate_exported(
     Raises:
         ExportError: an unknown runtime; the run was not exported, or its files are of another training step.
     """
-    folder = open_run(run, to_write=True)
+    folder = open_run(run)
     agent = load_agent(folder.path, checkpoint, "cpu")
     suite, config = agent.suite, agent.config
     played = exported_as(agent, folder, runtime, checkpoint)
@@ -278,6 +279,7 @@ def evaluate_exported(
     settings = replace(config.evaluation, **protocol)
     tasks = None if task is None else (suite.names[suite.index(task)],)
     conditions = EvaluationProtocol.of(settings, config.tasks)
+    folder = open_run(folder.path, to_write=True)
     known = RandomPlay(folder.path, config, suite, conditions)
     evaluation = evaluate_agent(compared, conditions, tasks, random_play=known)
     decisions, equal = (sum(column) for column in zip(*compared.compared, strict=True))

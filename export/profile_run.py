@@ -93,11 +93,12 @@ def profile(
     if not 1 <= decisions <= MAX_DECISIONS:
         raise ConfigError(f"decisions is {decisions}, expected 1 to {MAX_DECISIONS:,}")
     selection = Selection.of(targets)
-    run_folder = open_run(run, to_write=True)
+    run_folder = open_run(run)
     agent = load_agent(run_folder.path, checkpoint, "cpu")
     network = fold_agent(agent)  # refuses weights that are not finite before anything is played
     if not network.spiking:
         selection = Selection(tuple(t for t in selection.targets if "mac" in t.operations_pj), ())
+    run_folder = open_run(run_folder.path, to_write=True)
     folder = _folder(Path(out) if out is not None else run_folder.path / "profile")
     recordings = list(recorded_plays(agent, run_folder.path / "recordings", min(decisions, KEPT_DECISIONS)))
     profiles = tuple(_counted(agent, k, recording, decisions) for k, recording in enumerate(recordings))

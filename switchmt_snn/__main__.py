@@ -1,5 +1,5 @@
 """``python -m switchmt_snn`` is the command ``switchmt-snn``."""
 
-from switchmt_snn.cli import main
+from switchmt_snn.cli import run_program
 
-main()
+run_program()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from switchmt_snn.cli.parsing import parse, split
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 if TYPE_CHECKING:
     from switchmt_snn.tasks.report import EnvironmentReport
@@ -57,7 +57,7 @@ def command(argv: list[str]) -> int:
         image_layout=options.image_layout,
     )
     if options.json:
-        print(json_text([report.to_dict() for report in reports]))
+        output.print_json([report.to_dict() for report in reports])
         return 0
     for report in reports:
         print("\n".join(_lines(report)))

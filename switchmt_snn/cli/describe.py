@@ -9,7 +9,6 @@ import tyro
 
 from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.config import ExperimentConfig, load_config
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 
@@ -36,7 +35,7 @@ def command(argv: list[str]) -> int:
     methods = describe(config)
     if options.json:
         facts: dict[str, Any] = {"config": config.name, "source": source, "available_memory_bytes": available_bytes()}
-        print(json_text({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}}))
+        output.print_json({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}})
         return 0
     console = output.console()
     console.print(methods_table(methods, source))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from switchmt_snn.cli.parsing import parse
 from switchmt_snn.config import load_config
-from switchmt_snn.runs.files import json_text
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def command(argv: list[str]) -> int:
         "update_engines": {name: engine.status() for name, engine in ENGINES.items()},
     }
     if options.json:
-        print(json_text(facts))
+        output.print_json(facts)
         return 0
     for key, value in facts.items():
         shown = ", ".join(f"{k} {v or 'not installed'}" for k, v in value.items()) if isinstance(value, dict) else value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import nullcontext
 from importlib import import_module
 
 from switchmt_snn import __version__
@@ -46,10 +47,25 @@ COMMANDS = (
 )
 """Each is the function ``command`` of the file of its name, which is imported when it is called for."""
 
+_INTERRUPTED = 130
+
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``switchmt-snn``; exits with a code that USAGE lists."""
     sys.exit(_main(sys.argv[1:] if argv is None else argv))
+
+
+def run_program() -> None:
+    """The process ``switchmt-snn``: ``main``, and a second Ctrl-C ends what is still closing, without a traceback.
+
+    A program that calls ``main`` keeps its own way with Ctrl-C.
+    """
+    try:
+        main()
+    except SystemExit as stop:
+        if stop.code == _INTERRUPTED:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        raise
 
 
 def _main(argv: list[str]) -> int:
@@ -62,22 +78,22 @@ def _main(argv: list[str]) -> int:
     try:
         return _called(argv[0], argv[1:])
     except KeyboardInterrupt:  # also of the imports
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second one ends what is still closing, without a traceback
         print("switchmt-snn: interrupted", file=sys.stderr)
-        return 130
+        return _INTERRUPTED
 
 
 def _called(name: str, options: list[str]) -> int:
     from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
     from switchmt_snn.machine.program import runnable
-    from switchmt_snn.viewing.output import speak_any_encoding
+    from switchmt_snn.viewing.output import json_only, speak_any_encoding
 
     speak_any_encoding()
     try:
         if name not in COMMANDS:
             raise ConfigError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)}")
         command = import_module(f"switchmt_snn.cli.{name.replace('-', '_')}").command
-        return int(command(options))
+        with json_only() if "--json" in options else nullcontext():
+            return int(command(options))
     except SwitchMTError as error:
         print(f"switchmt-snn: {runnable(str(error))}", file=sys.stderr)
         return error.exit_code

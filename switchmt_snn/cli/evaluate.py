@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from switchmt_snn.cli.parsing import parse, split_one
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 
@@ -45,7 +44,7 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.tables import evaluation_table
 
-    path = open_run(run, to_write=True).path
+    path = open_run(run).path
     names = ("episodes", "epsilon", "seed", "num_envs", "max_episode_steps")
     protocol = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     facts: dict[str, Any] = {}
@@ -58,8 +57,9 @@ def command(argv: list[str]) -> int:
         with ProgressBars():
             evaluation, share = evaluate_exported(options.runtime, path, options.task, options.checkpoint, **protocol)
         facts = {"runtime": options.runtime, "equal_actions_share": share}
+    path = open_run(path, to_write=True).path  # where it was written
     if options.json:
-        print(json_text({"run": str(path), **facts, **evaluation.to_dict()}))
+        output.print_json({"run": str(path), **facts, **evaluation.to_dict()})
         return 0
     output.console().print(evaluation_table(evaluation))
     if facts:

@@ -9,7 +9,6 @@ from typing import Literal
 import tyro
 
 from switchmt_snn.cli.parsing import parse, split_one
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 
@@ -68,7 +67,7 @@ def command(argv: list[str]) -> int:
         )
     if options.json:
         files = {name: str(path) for name, path in result.files.items()}
-        print(json_text({"folder": str(result.folder), "files": files, "parity": result.parity}))
+        output.print_json({"folder": str(result.folder), "files": files, "parity": result.parity})
         return 0
     console.print(parity_table(result.parity))
     print(result.folder)

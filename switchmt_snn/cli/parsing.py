@@ -33,6 +33,7 @@ ARGUMENTS = {
 }
 """The positional argument of each command, and what it is."""
 
+_ON_OR_OFF = "an option that is on or off takes no value: --recording.tensorboard, or --recording.no-tensorboard"
 _REGISTRY = ConstructorRegistry()
 
 
@@ -48,6 +49,45 @@ def _whole_numbers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | N
         is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
         str_from_instance=lambda value: [str(value)],
     )
+
+
+@_REGISTRY.primitive_rule
+def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A number, or one that may be left open: null, as in YAML."""
+    if info.type not in (float, int | None, float | None):
+        return None
+    read = whole_number if info.type == int | None else _float
+    name = "INT" if info.type == int | None else "FLOAT"
+    null = () if info.type is float else ("null", "none")
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{None}}|{name}" if null else name,
+        instance_from_str=lambda words: None if words[0].lower() in null else read(words[0]),
+        is_instance=lambda value: (value is None and bool(null)) or isinstance(value, (int, float)),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+@_REGISTRY.primitive_rule
+def _numbers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A list of numbers."""
+    if info.type not in (tuple[int, ...], tuple[float, ...]):
+        return None
+    read, name = (whole_number, "INT") if info.type == tuple[int, ...] else (_float, "FLOAT")
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=f"[{name} [{name} ...]]",
+        instance_from_str=lambda words: tuple(map(read, words)),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: list(map(str, value)),
+    )
+
+
+def _float(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise ValueError(f"{word!r} is not a number") from None
 
 
 _TRUTHS = {"true": True, "false": False, "null": None, "none": None}
@@ -108,8 +148,9 @@ def split_one(kind: Any, argv: list[str], command: str, default: Any) -> tuple[s
     names, flags = split(kind, argv, command, default)
     if len(names) > 1:
         argument = ARGUMENTS[command][0]
+        hint = f"{_ON_OR_OFF}; " if names[-1].lower() in ("true", "false") else ""
         raise ConfigError(
-            f"{command} got {' '.join(names)}, expected one {argument}; see switchmt-snn {command} --help"
+            f"{command} got {' '.join(names)}, expected one {argument}; {hint}see switchmt-snn {command} --help"
         )
     return names[0] if names else None, flags
 
@@ -181,4 +222,6 @@ def _one_line(boxed: str, command: str) -> str:
         lines = lines[1:]
     text = " ".join(line for line in lines if not set(line) <= set("─-"))
     text = text.split("For full helptext")[0].split("Argument helptext")[0].strip().rstrip(".")
+    if text.lower().startswith("unrecognized options: ") and text.rpartition(" ")[2].lower() in ("true", "false"):
+        text += f"; {_ON_OR_OFF}"
     return f"{text}; see switchmt-snn {command} --help"

@@ -10,7 +10,8 @@ from typing import Literal
 import tyro
 
 from switchmt_snn.cli.parsing import parse, split_one
-from switchmt_snn.runs.files import file_name, json_text
+from switchmt_snn.runs.files import file_name
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -54,23 +55,24 @@ def command(argv: list[str]) -> int:
 
     if options.live:
         require_screen()
-    path = open_run(run, to_write=True).path
+    path = open_run(run).path
     settings = FilmSettings(options.task, options.episodes, options.seconds, options.fps).require()
     agent = watched_agent(path, options.runtime, options.checkpoint)
     changes = {name: getattr(options, name) for name in ("seed", "epsilon") if getattr(options, name) is not None}
     config = agent.agent.config
     evaluation = replace(config.evaluation, episodes=options.episodes or 1, num_envs=1, **changes)
     names = tuple(agent.suite.names[agent.suite.index(name)] for name in options.task) or agent.suite.names[:1]
+    protocol = EvaluationProtocol.of(evaluation, config.tasks)
+    path = open_run(path, to_write=True).path
     out = options.out
     if out is None and not options.live:
         runtime = "" if options.runtime == "torch" else f"-{options.runtime}"
         out = path / "films" / f"{file_name(*names)}-step-{agent.step}{runtime}.mp4"
-    protocol = EvaluationProtocol.of(evaluation, config.tasks)
     film = make_film(agent, protocol, settings, out, Window if options.live else None, note=_say)
     if film.stopped:
         _say(f"stopped after {film.frames:,} frames, which are kept")
     if options.json:
-        print(json_text({"film": None if film.path is None else str(film.path), **film.facts}))
+        output.print_json({"film": None if film.path is None else str(film.path), **film.facts})
         return 130 if film.stopped else 0
     for lane in film.facts["tasks"]:
         scores = ", ".join(f"{episode['score']:g}" for episode in lane["episodes"])

@@ -10,7 +10,6 @@ import tyro
 
 from switchmt_snn.cli.parsing import parse, split
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 
@@ -77,7 +76,7 @@ def command(argv: list[str]) -> int:
     if len(profiles) > 1:
         report = compare_profiles(profiles, options.out)
     if options.json:
-        print(json_text(profiles[0].facts) if len(profiles) == 1 else report.with_suffix(".json").read_text("utf-8"))
+        output.print_json(profiles[0].facts if len(profiles) == 1 else report.with_suffix(".json").read_text("utf-8"))
         return 0
     _print_profiles([one.facts for one in profiles])
     print(report)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.viewing import output
 
 
@@ -46,7 +46,7 @@ def command(argv: list[str]) -> int:
                 "is there and writable; name another one"
             ) from error
     if options.json:
-        print(json_text(replayed.to_dict(), indent=1))
+        output.print_json(replayed.to_dict(), indent=1)
     else:
         output.console().print(replay_table(replayed))
         if options.out is not None:

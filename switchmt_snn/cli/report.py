@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from switchmt_snn.cli.parsing import parse, split
+from switchmt_snn.viewing import output
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,11 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.viewing.report.page import write_report
 
     chosen: list[str | None] = [*names] or [None]  # None is the newest run
-    runs = [open_run(name, to_write=True).path for name in chosen]
+    found = [open_run(name).path for name in chosen]
+    runs = [open_run(path, to_write=True).path for path in found]
     page = write_report(runs, options.out, options.figures)
-    print(page.with_suffix(".json").read_text("utf-8") if options.json else page)
+    if options.json:
+        output.print_json(page.with_suffix(".json").read_text("utf-8"))
+    else:
+        print(page)
     return 0

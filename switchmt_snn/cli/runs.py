@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from switchmt_snn.cli.parsing import parse, split_one
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 
@@ -32,7 +31,7 @@ def command(argv: list[str]) -> int:
     for one in damaged:
         print(f"damaged: {one.path.name}: {one.problem}", file=sys.stderr)
     if options.json:
-        print(json_text([run.to_dict() for run in runs], indent=1))
+        output.print_json([run.to_dict() for run in runs], indent=1)
     elif runs:
         output.console().print(runs_table(runs))
     else:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.errors import ConfigError, SwitchMTError
 from switchmt_snn.machine.program import program
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 if TYPE_CHECKING:
@@ -46,6 +45,8 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     source, rest = split_one(StudyOptions, argv, "study", StudyOptions())
     options = parse(StudyOptions, rest, "study", StudyOptions())
+    if "--seeds" in rest and not options.seeds:  # an empty list would silently be the file's
+        raise ConfigError("study got --seeds without a number, expected seeds, as in --seeds 1 2 3")
     from switchmt_snn.study.folder import STUDIES, StudyFolder
     from switchmt_snn.study.grid import load_study, studies
 
@@ -80,7 +81,7 @@ def _status(console: Console, study: Study, folder: StudyFolder, as_json: bool) 
 
     facts = status_facts(study, folder)
     if as_json:
-        print(json_text(facts, indent=1))
+        output.print_json(facts, indent=1)
     else:
         console.print(status_table(facts))
     return 0
@@ -98,7 +99,7 @@ def _dry_run(console: Console, study: Study, folder: StudyFolder, options: Study
     costs = probe(trials, jobs, lambda text: console.print(text, highlight=False, soft_wrap=True))
     facts = cost_facts(study, trials, costs, jobs, folder.path)
     if options.json:
-        print(json_text(facts, indent=1))
+        output.print_json(facts, indent=1)
     else:
         console.print(cost_table(facts))
     return 0
@@ -118,7 +119,7 @@ def _report(console: Console, study: Study, folder: StudyFolder, as_json: bool) 
         return
     console.print(f"tables: {folder.path / 'tables.md'}; report: {page}", highlight=False, soft_wrap=True)
     if as_json:
-        print((folder.path / "study.json").read_text("utf-8"))
+        output.print_json((folder.path / "study.json").read_text("utf-8"))
 
 
 def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOptions) -> int:

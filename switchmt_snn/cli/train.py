@@ -13,7 +13,6 @@ from switchmt_snn.cli.parsing import parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.machine.program import program, runnable
-from switchmt_snn.runs.files import json_text
 from switchmt_snn.viewing import output
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ def command(argv: list[str]) -> int:
         return 0
     if options.json:
         scores = None if result.evaluation is None else result.evaluation.to_dict()
-        print(json_text({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores}))
+        output.print_json({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores})
     again = f"{program()} train --run {shlex.quote(str(result.path))}"
     if result.status == "stopped":
         console.print(f"stopped at step {result.step:,}; continue exactly here with: {again}", soft_wrap=True)
@@ -124,6 +123,10 @@ def _write_report(console: Console, path: Path) -> None:
 
 def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:
     """The config that flags change: the file that is named, else the run's own, else quickstart's."""
+    if run is not None:
+        from switchmt_snn.runs.packing import refuse_pretrained
+
+        refuse_pretrained(run)
     if source is None and run is not None:
         from switchmt_snn.runs.folder import RunFolder
 

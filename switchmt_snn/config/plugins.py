@@ -146,7 +146,7 @@ def user_code(
         yield
     except SwitchMTError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if not outside:
             raise
         raise kind(f"{seen} ({failure(error)}), expected {expected}") from error

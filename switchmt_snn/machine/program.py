@@ -10,7 +10,8 @@ from pathlib import Path
 
 NAME = "switchmt-snn"
 _COMMAND = re.compile(
-    rf"(?<![\w/.-]){NAME} (?=(?:train|evaluate|play|export|profile|report|study|runs|pack|describe|doctor|check-env)\b)"
+    rf"(?<![\w/.-]){NAME} "
+    r"(?=(?:train|evaluate|play|export|profile|report|study|replay-policies|runs|pack|describe|doctor|check-env)\b)"
 )
 
 

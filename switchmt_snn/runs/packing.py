@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import tempfile
 from pathlib import Path
@@ -37,7 +38,8 @@ def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder
     Args:
         run: a folder of that name comes before a pretrained run.
         to_write: files will be added to the run. A pretrained run is then copied to ``runs/pretrained/NAME`` the first
-            time, and opened there from then on: the package's own files stay as they are.
+            time, and opened there from then on: the package's own files stay as they are. Open a run without it until
+            nothing can be refused any more, then ``open_run(folder.path, to_write=True)``.
 
     Raises:
         RunFolderError: no such run, or it cannot be copied.
@@ -45,20 +47,43 @@ def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder
     if run is None:
         return RunFolder(latest_run()).require()
     path = Path(run)
-    if path.exists() or len(path.parts) != 2 or path.parts[0] != _PREFIX:
+    name = _pretrained_name(path)
+    if name is None:
         return RunFolder(path).require()
-    name = path.parts[1]
     if name not in pretrained_names():
         raise RunFolderError(
             f"no pretrained run {name!r}, expected one of {', '.join(pretrained_names())}"
             f"{nearest(name, pretrained_names())}"
         )
+    copied = RunFolder(Path("runs") / _PREFIX / name)
+    if copied.is_run:
+        return copied
     if not to_write:
         return RunFolder(PRETRAINED / name)
-    copied = Path("runs") / _PREFIX / name
-    if not RunFolder(copied).is_run:
-        _whole_copy(PRETRAINED / name, copied)
-    return RunFolder(copied)
+    _whole_copy(PRETRAINED / name, copied.path)
+    return copied
+
+
+def refuse_pretrained(run: str | Path) -> None:
+    """Refuse to train in a run that comes with the package, or under its name.
+
+    Raises:
+        RunFolderError: ``run`` is ``pretrained/NAME``, and no folder of one's own.
+    """
+    name = _pretrained_name(Path(run))
+    if name in pretrained_names():
+        config = shlex.quote(str(PRETRAINED / name / "config.yaml"))
+        raise RunFolderError(
+            f"{run} comes with the package and holds weights only, expected a run with its replay; it can be "
+            f"evaluated, exported and profiled; training needs a new run: switchmt-snn train {config} --run NEW_FOLDER"
+        )
+
+
+def _pretrained_name(path: Path) -> str | None:
+    """NAME of ``pretrained/NAME``, or of its folder within the package; None for any other folder."""
+    if path.exists():
+        return path.name if path.resolve().parent == PRETRAINED.resolve() else None
+    return path.parts[1] if len(path.parts) == 2 and path.parts[0] == _PREFIX else None
 
 
 def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> Path:

@@ -28,7 +28,7 @@ from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
 from switchmt_snn.runs.initial_weights import InitialWeights, read_initial_weights
 from switchmt_snn.runs.logs import RunLogs
-from switchmt_snn.runs.packing import open_run
+from switchmt_snn.runs.packing import open_run, refuse_pretrained
 from switchmt_snn.runs.plan import decide, plan
 from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.signals import stop_requests
@@ -120,6 +120,8 @@ def _train(
     policy: type[Criterion] | None,
     suite: type[Suite] | None,
 ) -> RunResult:
+    if run is not None:
+        refuse_pretrained(run)
     folder = RunFolder(Path(run)) if run is not None else None
     stored = folder.config() if folder is not None and folder.is_run else None
     config = _asked(config, folder, stored)
@@ -405,11 +407,12 @@ def evaluate(
     Raises:
         SwitchMTError: no run, no checkpoint, no such task, or a protocol out of range.
     """
-    folder = open_run(run, to_write=save)
+    folder = open_run(run)
     agent = load_agent(folder.path, checkpoint)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
     conditions = EvaluationProtocol.of(settings, agent.config.tasks)
+    folder = open_run(folder.path, to_write=save)
     known = RandomPlay(folder.path, agent.config, agent.suite, conditions) if save else None
     evaluation = evaluate_agent(agent, conditions, tasks, note, random_play=known)
     if save:

@@ -55,9 +55,9 @@ class GymSuite(Suite):
         """
         names, wrappers = self.config.names, self.config.wrappers
         probes = [make_environment(name, wrappers) for name in names]
-        counts = [num_actions(name, env.action_space) for name, env in zip(names, probes, strict=True)]
+        counts = [num_actions(name, env.action_space, wrappers) for name, env in zip(names, probes, strict=True)]
         layouts = [
-            frame_layout(name, env.observation_space, self.config.image_layout)
+            frame_layout(name, env.observation_space, self.config.image_layout, wrappers)
             for name, env in zip(names, probes, strict=True)
         ]
         first_actions = tuple(first_action(env) for env in probes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -180,6 +181,12 @@ def _hint(name: str) -> str:
         return (
             f"; an id that a module registers is named module:Id, such as my_module:{name}"
             f"{nearest(name, gymnasium.registry)}"
+        )
+    old = getattr(getattr(sys.modules.get("gym"), "envs", None), "registry", ())
+    if parse_id(name)[1] in old:
+        return (
+            f"; {module!r} registers it in gym, which came before Gymnasium; use a version of it for Gymnasium, or "
+            "register a class of yours that plays it"
         )
     own = [
         f"{module}:{env_id}"

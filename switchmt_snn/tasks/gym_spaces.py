@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -48,25 +49,29 @@ def channels_last(observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.moveaxis(observation, -1, 0)
 
 
-def frame_layout(name: str, space: gymnasium.Space[Any], image_layout: ImageLayout) -> FrameLayout:
+def frame_layout(
+    name: str, space: gymnasium.Space[Any], image_layout: ImageLayout, wrappers: Sequence[str] = ()
+) -> FrameLayout:
     """How observations of a space become frames.
 
     Args:
         name: of the task, for errors.
         space: ``observation_space``.
         image_layout: where the channels of images are; ``by_shape`` tells it from the shape, or refuses.
+        wrappers: the ones that the task has already, which a remedy keeps.
 
     Raises:
         TaskError: no ``Box`` of one to three dimensions, an image that is not uint8 or bool, or an image whose shape
             does not say which axis holds the channels.
     """
+    flatten = with_wrapper(wrappers, "FlattenObservation")
     if not isinstance(space, gymnasium.spaces.Box):
-        raise TaskError(f"task {name!r} observes {_short(space)}, expected a Box; {_remedy(space)}")
+        raise TaskError(f"task {name!r} observes {_short(space)}, expected a Box; {_remedy(space, flatten)}")
     shape = tuple(int(side) for side in space.shape)
     if not (1 <= len(shape) <= 3 and all(shape)):
         raise TaskError(
             f"task {name!r} observes {_short(space)}, expected a vector or an image (one to three dimensions, none "
-            f"empty); {FLATTEN}"
+            f"empty); {flatten}"
         )
     kind = np.dtype(space.dtype).kind if space.dtype is not None else "f"
     if len(shape) == 1:
@@ -76,7 +81,7 @@ def frame_layout(name: str, space: gymnasium.Space[Any], image_layout: ImageLayo
     if not (space.dtype == np.uint8 or kind == "b"):
         raise TaskError(
             f"task {name!r} observes {_short(space)}, expected uint8 or bool: {len(shape)} dimensions are taken for an "
-            f"image; if they are none, {FLATTEN}; if they are, wrap the environment to return uint8"
+            f"image; if they are none, {flatten}; if they are, wrap the environment to return uint8"
         )
     scale = 1.0 if kind == "b" else 1.0 / 255.0
     if len(shape) == 2:
@@ -88,7 +93,13 @@ def frame_layout(name: str, space: gymnasium.Space[Any], image_layout: ImageLayo
     return FrameLayout("channels_last", (shape[2], *shape[:2]), scale)
 
 
-FLATTEN = "set tasks.wrappers=[FlattenObservation]"
+def with_wrapper(wrappers: Sequence[str], wrapper: str) -> str:
+    """What to do, where one more wrapper helps: the whole list, as the setting takes it.
+
+    >>> with_wrapper(["FlattenAction"], "FlattenObservation")
+    'set tasks.wrappers=[FlattenAction,FlattenObservation]'
+    """
+    return f"set tasks.wrappers=[{','.join((*wrappers, wrapper))}]"
 
 
 def _layout_of(name: str, shape: tuple[int, ...]) -> ImageLayout:
@@ -111,7 +122,7 @@ def _layout_of(name: str, shape: tuple[int, ...]) -> ImageLayout:
     return signs.pop()
 
 
-def num_actions(name: str, space: gymnasium.Space[Any]) -> int:
+def num_actions(name: str, space: gymnasium.Space[Any], wrappers: Sequence[str] = ()) -> int:
     """Actions of a task.
 
     Raises:
@@ -121,19 +132,19 @@ def num_actions(name: str, space: gymnasium.Space[Any]) -> int:
         return int(space.n)
     remedy = "choose some actions in a wrapper of your own (gymnasium.ActionWrapper; tasks.wrappers=[module:Name])"
     if isinstance(space, (gymnasium.spaces.MultiDiscrete, gymnasium.spaces.MultiBinary)):
-        remedy = "set tasks.wrappers=[FlattenAction], which makes one action of every combination"
+        remedy = f"{with_wrapper(wrappers, 'FlattenAction')}, which makes one action of every combination"
     raise TaskError(
         f"task {name!r} has the action space {_short(space)}, expected Discrete: a Q-network lists actions; {remedy}"
     )
 
 
-def _remedy(space: gymnasium.Space[Any]) -> str:
+def _remedy(space: gymnasium.Space[Any], flatten: str) -> str:
     try:
         flattens = space.is_np_flattenable
     except NotImplementedError:  # of a space that the environment's package made
         flattens = False
     if flattens:
-        return FLATTEN
+        return flatten
     return (
         "choose its numbers in a wrapper (tasks.wrappers=[module:Name]): one of the environment's package, such as "
         "minigrid.wrappers:ImgObsWrapper, or a gymnasium.ObservationWrapper of your own"

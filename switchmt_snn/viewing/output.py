@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
 import os
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, TextIO
+
+from switchmt_snn.runs.files import json_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,6 +30,25 @@ def speak_any_encoding() -> None:
         reconfigure: Any = getattr(stream, "reconfigure", None)
         if reconfigure is not None:
             reconfigure(errors="spelled")
+
+
+_for_json: list[TextIO] = []
+
+
+@contextlib.contextmanager
+def json_only() -> Iterator[None]:
+    """Within it stdout is for ``print_json`` alone; what else is printed, as by environments, goes to stderr."""
+    _for_json.append(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _for_json.pop()
+
+
+def print_json(value: Any, indent: int | None = None) -> None:
+    """Print plain values as JSON, or a text that is JSON already, as the result of a command."""
+    print(value if isinstance(value, str) else json_text(value, indent), file=_for_json[-1] if _for_json else None)
 
 
 def _spelled(error: UnicodeError) -> tuple[str, int]:

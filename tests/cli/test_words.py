@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from switchmt_snn.errors import ConfigError
 from switchmt_snn.machine import program as names
 from switchmt_snn.viewing.output import FILE_COLUMNS, console
 from switchmt_snn.viewing.tables import evaluation_table
+from tests.tasks.odd_envs import Plain
 
 TRAIN = TrainOptions(experiment=ExperimentConfig())
 PONG = ["Pong-of-somebody-with-a-long-name-v0", "pong"]
@@ -195,3 +197,13 @@ def test_tables_in_files_have_room(monkeypatch: pytest.MonkeyPatch) -> None:
     assert console().width == FILE_COLUMNS
     monkeypatch.setenv("COLUMNS", "90")
     assert console().width == 90
+
+
+def test_what_environments_print_is_not_mixed_with_json(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Plain, "reward", lambda self, action: print("hello") or 0.0)
+    code, out, err = call(capsys, "check-env", "tests.tasks.odd_envs:Plain-v0", "--steps", "40", "--json")
+    assert code == 0
+    assert json.loads(out)[0]["task"] == "tests.tasks.odd_envs:Plain-v0"
+    assert "hello" in err

@@ -84,7 +84,7 @@ class Reader:
         programs = folder / ".bin"
         programs.mkdir()
         command = programs / "switchmt-snn"  # as pip makes it: the current folder is not on the module path by itself
-        command.write_text(f"#!{sys.executable}\nimport sys\nfrom switchmt_snn.cli import main\nsys.exit(main())\n")
+        command.write_text(f"#!{sys.executable}\nimport sys\nfrom switchmt_snn.cli import run_program\nrun_program()\n")
         command.chmod(command.stat().st_mode | stat.S_IEXEC)
         path = f"{programs}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         self.environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}

@@ -33,6 +33,7 @@ from switchmt_snn.study.statistics import (
 )
 from switchmt_snn.study.timing import makespan
 from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.gym_spaces import with_wrapper
 from switchmt_snn.tasks.report import check_env
 from switchmt_snn.viewing.report.curves import running_means, thinned
 from switchmt_snn.viewing.report.page import write_report
@@ -60,6 +61,7 @@ EXAMPLES: tuple[Any, ...] = (
     file_name,
     json_text,
     make_environment,
+    with_wrapper,
     check_env,
     shown,
     train,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from switchmt_snn import evaluate, load_agent, train
 from switchmt_snn.errors import CheckpointError, RunFolderError
-from switchmt_snn.export import ExportSettings, export, profile
+from switchmt_snn.export import ExportSettings, export, load_exported, profile
 from switchmt_snn.runs import packing
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.packing import open_run, pack
@@ -105,6 +106,25 @@ def test_a_pretrained_run_is_read_where_it_is_and_copied_to_be_written(own: Path
         for kind in ("csv", "json")
     }
     assert open_run("pretrained/small", to_write=True).path == copied  # the copy with its results, not a fresh one
+
+
+def test_what_was_exported_of_a_pretrained_run_is_read_under_its_name(own: Path) -> None:
+    export("pretrained/small", ExportSettings(onnx=True, parity_decisions=8))
+    assert load_exported("pretrained/small").step == 400
+    assert load_exported(own).step == 400  # the package's own folder is the same run, and stays as it is
+    assert not (own / "export").exists()
+
+
+@pytest.mark.parametrize("name", ["pretrained/small", "the package's folder"])
+def test_training_in_a_pretrained_run_is_refused_and_its_remedy_works(own: Path, name: str) -> None:
+    run = name if name == "pretrained/small" else str(own)
+    for config in (None, load_agent("pretrained/small").config):
+        with pytest.raises(RunFolderError, match="comes with the package and holds weights only") as refused:
+            train(config, run=run)
+    command = str(refused.value).split("switchmt-snn train ")[1]
+    config = shlex.split(command)[0]
+    assert train(config, run="mine").step == 400
+    assert not Path("pretrained").exists()
 
 
 def test_copies_made_at_once_are_whole(own: Path) -> None:

@@ -96,6 +96,11 @@ class Raises(Plain):
         return later(0, 1, self) and 1 / 0
 
 
+class Exits(Plain):
+    def reward(self, action: Any) -> Any:
+        raise SystemExit(3)
+
+
 class DoubleObservation(Plain):
     """float64 and whole numbers for a float32 space: every value has its float32."""
 
@@ -222,6 +227,10 @@ class Combined(Plain):
 
     def reward(self, action: Any) -> Any:
         return float(10 * action[0] + action[1])
+
+
+class ComposedAndCombined(Composed):
+    action_space = MultiDiscrete([2, 3])
 
 
 class TooManyCombinations(Plain):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import random
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -166,6 +169,27 @@ def test_a_refusal_says_what_to_do(names: tuple[str, ...], message: str) -> None
         suite_of(*names)
 
 
+def test_a_refusal_names_all_wrappers_that_a_task_needs() -> None:
+    with pytest.raises(TaskError, match=r"set tasks\.wrappers=\[FlattenAction,FlattenObservation\]$"):
+        suite_of("ComposedAndCombined", wrappers=("FlattenAction",))
+    with pytest.raises(TaskError, match=r"set tasks\.wrappers=\[FlattenObservation,FlattenAction\]"):
+        suite_of("ComposedAndCombined", wrappers=("FlattenObservation",))
+    assert suite_of("ComposedAndCombined", wrappers=("FlattenObservation", "FlattenAction")).frame_shape == (16,)
+
+
+def test_an_id_that_a_module_registers_in_gym_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    gym = SimpleNamespace(envs=SimpleNamespace(registry={"Old-v0": None}))
+    monkeypatch.setitem(sys.modules, "gym", gym)
+    with pytest.raises(TaskError, match="registers it in gym, which came before Gymnasium"):
+        suite_of("Old")
+
+
+def test_an_environment_that_exits_is_one_line() -> None:
+    play = begun(suite_of("Exits"))
+    with pytest.raises(TaskError, match=r"fails in step \(SystemExit: 3 at odd_envs\.py, line \d+\)"):
+        play.step(np.asarray([0]))
+
+
 def test_composed_observations_are_flattened_on_request() -> None:
     suite = suite_of("Composed", wrappers=("FlattenObservation",))
     assert suite.frame_shape == (16,)
@@ -228,3 +252,12 @@ def test_only_environments_of_gymnasium_itself_are_played_in_several_threads_and
     assert (suite_of("Plain").thread_safe, suite_of("Plain").versioned) == (False, False)
     wrapped = TasksConfig(suite="gym", names=("CartPole-v1",), wrappers=(f"{MODULE}:Halves",))
     assert (make_suite(wrapped).thread_safe, make_suite(wrapped).versioned) == (False, False)
+
+
+def test_the_wrapper_of_the_examples_sets_one_number_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    wrapped = make_environment("Pendulum-v1", ["my_wrapper:OneAxis"])
+    assert wrapped.action_space == gymnasium.spaces.Discrete(3)
+    assert [float(wrapped.action(action)[0]) for action in range(3)] == [0.0, -2.0, 2.0]  # its torque
+    with pytest.raises(TaskError, match=r"the action space is Discrete\(3\), expected a Box with finite bounds"):
+        make_environment(f"{MODULE}:Plain-v0", ["my_wrapper:OneAxis"])
