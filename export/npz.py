@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from switchmt_snn.errors import ExportError
+from switchmt_snn.errors import ExportError, reason_of
 from switchmt_snn.machine.memory import available_bytes
 
 Array = npt.NDArray[Any]
@@ -44,7 +44,7 @@ def read_npz(path: Path, keys: Sequence[str], expected: str) -> dict[str, Array]
             _require_room(sum(info.file_size for info in wanted.values()))
             stored = {key: _array(archive, info) for key, info in wanted.items()}
     except Exception as error:  # zipfile and NumPy's headers raise whatever their parsers meet
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise ExportError(f"{path} cannot be read ({reason:.120}), expected {expected}") from error
     if not stored:
         names = ", ".join(member.removesuffix(".npy") for member in members)

@@ -74,13 +74,19 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
-def printable(text: str) -> str:
-    """Text of a file or of another program on one line of printable characters.
+def printable(text: object) -> str:
+    """A text as it may reach a terminal: on one line, without control characters, of at most 500 characters.
 
-    >>> printable("a\\n\\x1b[2J")
-    'a ?[2J'
+    >>> printable("a\\x1b[2J")
+    'a\\\\x1b[2J'
     """
-    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in str(text)[:501])
+    return shown if len(shown) <= 500 else shown[:497] + "..."
+
+
+def reason_of(error: BaseException) -> str:
+    """What an exception says, as ``printable``, its lines as one; or its class."""
+    return printable(" ".join(str(error).split())) or type(error).__name__
 
 
 def require_saved(state: object, names: Iterable[str], owner: str) -> None:

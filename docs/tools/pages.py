@@ -25,6 +25,7 @@ from docs.tools.picture import picture
 from docs.tools.pretrained_page import pretrained_cards, pretrained_page
 from docs.tools.profile_spread import spread
 from docs.tools.recipe_page import recipe_page
+from docs.tools.reliability_page import reliability_page
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import field_documentation, load_config
 from switchmt_snn.export.report.page import microjoule
@@ -358,6 +359,7 @@ PAGES = {
     "results/export/README.md": export_page,
     "results/profile/README.md": profile_page,
     "results/recipe/README.md": recipe_page,
+    "results/reliability/README.md": lambda: reliability_page(ROOT / "results" / "reliability"),
     "switchmt_snn/pretrained/README.md": pretrained_page,
     **pretrained_cards(),
     "results/atari/README.md": atari_page,

@@ -18,7 +18,7 @@ import torch
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import DecisionMaker
 from switchmt_snn.config import ExperimentConfig
-from switchmt_snn.errors import ExportError
+from switchmt_snn.errors import ExportError, reason_of
 from switchmt_snn.export.npz import not_finite
 from switchmt_snn.export.runtimes.guarded import nir_tree, read_file, require_runnable
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
@@ -68,9 +68,9 @@ def read_nir(path: Path) -> nir.NIRGraph:
             raise ValueError(f"it is a {type(graph).__name__}")
         for name, node in graph.nodes.items():
             for parameter, values in vars(node).items():
-                if not isinstance(values, np.ndarray):
+                if parameter in ("padding", "metadata", "input_type", "output_type") or values is None:
                     continue
-                if values.dtype.kind not in "biuf":
+                if np.asarray(values).dtype.kind not in "biuf":
                     raise ValueError(f"{parameter} of {name!r:.60} holds text, expected numbers")
                 if not np.isfinite(values).all():
                     raise ValueError(f"{parameter} of {name!r:.60} holds {not_finite(values)}, expected finite numbers")
@@ -85,7 +85,7 @@ def _readable(source: Path | bytes, expected: str) -> Iterator[None]:
         raise
     except Exception as error:  # onnx, onnxruntime, h5py and nir raise whatever their parsers meet
         name = str(source) if isinstance(source, Path) else "a model in memory"
-        reason = "".join(letter if letter.isprintable() else " " for letter in str(error)) or type(error).__name__
+        reason = reason_of(error)
         raise ExportError(f"{name} cannot be read ({reason:.160}), expected {expected}; export again") from error
 
 
@@ -204,7 +204,7 @@ class OnnxAgent:
         try:
             values: list[npt.NDArray[Any]] = self.session.run(names, fed)
         except Exception as error:  # onnxruntime raises classes of its own, and ValueError for inputs that do not fit
-            reason = " ".join(str(error).split())
+            reason = reason_of(error)
             raise ExportError(
                 f"the ONNX file cannot decide ({reason:.160}), expected a model of this run; export the run again"
             ) from error

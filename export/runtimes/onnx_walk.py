@@ -62,9 +62,9 @@ def _require_graph(graph: onnx.GraphProto, outside: frozenset[str], level: int, 
         if left[0] < 0:
             raise ValueError(f"it has more than {MOST_NODES:,} operators")
         if node.domain not in ("", "ai.onnx") or (node.op_type not in _BY_INPUT and node.op_type not in _BY_VALUE):
+            name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
             raise ValueError(
-                f"it has the operator {node.domain!s:.60} {node.op_type!s:.60}, expected one whose cost follows from "
-                "the sizes of its inputs"
+                f"it has the operator {name!s:.60}, expected one whose cost follows from the sizes of its inputs"
             )
         for part in _attached(node):
             if isinstance(part, onnx.TensorProto):

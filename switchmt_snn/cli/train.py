@@ -73,7 +73,8 @@ def command(argv: list[str]) -> int:
     elif result.evaluation is not None:
         console.print(evaluation_table(result.evaluation))
         _say_what_next(console, config, result.path, result.step)
-    if result.status != "already_finished":
+    # A run that was killed after its last evaluation has no page yet.
+    if result.status != "already_finished" or not (result.path / "report.html").is_file():
         _write_report(console, result.path)
     if not options.json:
         print(result.path)

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.errors import ConfigError, printable, reason_of
 
 MOST_BYTES = 65_536
 """Most bytes of a file (the longest of ours have 4,000; PyYAML reads some 100,000 bytes per second)."""
@@ -72,7 +72,7 @@ def parse_yaml(text: str, where: str, what: str) -> Any:
     try:
         return _Reader(text).document()
     except yaml.YAMLError as error:
-        reason = printable(" ".join(str(error).split()))
+        reason = reason_of(error)
         raise ConfigError(f"{printable(where)} is not YAML that is taken here ({reason}), expected {what}") from error
 
 
@@ -94,12 +94,6 @@ def plain_value(text: str) -> Any:
     if _FLOAT.fullmatch(text):
         return float(digits)
     return _SPECIAL.get(text.lower(), text)
-
-
-def printable(text: object) -> str:
-    """A text as it may reach a terminal: on one line, without control characters, of at most 500 characters."""
-    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in str(text)[:501])
-    return shown if len(shown) <= 500 else shown[:497] + "..."
 
 
 class _Reader:

@@ -13,8 +13,8 @@ import yaml
 from switchmt_snn.config.checks import field_types
 from switchmt_snn.config.decided import KEY, closed, opened, presumably_open, record
 from switchmt_snn.config.experiment import ExperimentConfig
-from switchmt_snn.config.strict_yaml import parse_yaml, printable, read_text
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.config.strict_yaml import parse_yaml, read_text
+from switchmt_snn.errors import ConfigError, did_you_mean, printable
 
 
 def load_config(

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from switchmt_snn.errors import CheckpointError, ConfigError, require_saved
+from switchmt_snn.errors import CheckpointError, ConfigError, reason_of, require_saved
 from switchmt_snn.learning.saved_values import require_like, require_moments
 
 
@@ -164,5 +164,5 @@ def _fitting(name: str, expected: str) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        reason = f"{type(error).__name__}: {reason_of(error)}"
         raise _unfitting(name, f"a state that does not fit ({reason:.300})", expected) from error

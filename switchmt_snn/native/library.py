@@ -14,6 +14,7 @@ import platform
 import re
 import shlex
 import shutil
+import stat
 import subprocess
 import tempfile
 from contextlib import suppress
@@ -53,23 +54,52 @@ def library() -> ctypes.CDLL:
     """
     compiler = _compiler()
     kept = _cache() / f"native-{_key(compiler)}.so"
-    try:
+    if _is_ours(kept):
         loaded = ctypes.CDLL(str(kept))
-    except OSError:  # not there, or damaged
+    else:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
             built = _build(compiler, Path(scratch))
             loaded = ctypes.CDLL(str(built))
             with suppress(OSError):  # a cache that cannot be written to
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                handle, temporary = tempfile.mkstemp(dir=kept.parent)
-                os.close(handle)
-                shutil.copyfile(built, temporary)
-                os.replace(temporary, kept)
+                _keep(built.read_bytes(), kept)
     for name, arguments in signatures().items():
         if hasattr(loaded, name):  # products of bits and of bfloat16 are compiled only if the processor has them
             function = getattr(loaded, name)
             function.argtypes, function.restype = arguments, None
     return loaded
+
+
+def _is_ours(kept: Path) -> bool:
+    """Whether a kept library is whole, as its sum says, and nobody but this user can have written it.
+
+    Loading a library runs it: one that is cut off ends the process, one of somebody else's does what they like.
+    """
+    summed = kept.with_suffix(".sha256")
+    try:
+        for facts, kind in (
+            (kept.parent.stat(), stat.S_ISDIR),
+            (kept.lstat(), stat.S_ISREG),
+            (summed.lstat(), stat.S_ISREG),
+        ):
+            if not kind(facts.st_mode) or facts.st_uid != os.getuid() or facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                return False
+        return summed.read_text("ascii") == hashlib.sha256(kept.read_bytes()).hexdigest()
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _keep(content: bytes, kept: Path) -> None:
+    """Put a library and its sum into the cache, readable and writable for this user only."""
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    kept.parent.chmod(0o700)
+    for path, written in ((kept, content), (kept.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())):
+        handle, temporary = tempfile.mkstemp(dir=kept.parent)
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(written)
+            os.replace(temporary, path)
+        finally:
+            Path(temporary).unlink(missing_ok=True)
 
 
 def signatures() -> dict[str, list[type[Any]]]:

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from switchmt_snn.errors import RunFolderError, printable
+from switchmt_snn.errors import RunFolderError, reason_of
 from switchmt_snn.runs.files import json_text, write_atomically
 from switchmt_snn.runs.folder import read_environment
 
@@ -48,7 +48,7 @@ def note_changes(folder: Path, environment: dict[str, Any], step: int) -> list[s
                 values |= row.get(kind, {})
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise RunFolderError(
-            f"{path} cannot be read ({printable(str(error)):.80}), expected JSON lines; delete it"
+            f"{path} cannot be read ({reason_of(error):.80}), expected JSON lines; delete it"
         ) from error
     new = {kind: _differing(known[kind], values) for kind, values in now.items()}
     if any(new.values()):

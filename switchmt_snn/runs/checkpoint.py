@@ -29,7 +29,7 @@ import safetensors.torch
 import torch
 import zstandard
 
-from switchmt_snn.errors import CheckpointError, require_saved, shown
+from switchmt_snn.errors import CheckpointError, reason_of, require_saved, shown
 from switchmt_snn.replay.ring import FrameReplay, Segment
 from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
 from switchmt_snn.runs.manifest import FORMAT, read_json, read_manifest, seal
@@ -85,7 +85,7 @@ def fitting_weights() -> Iterator[None]:
     except RuntimeError as error:
         if "loading state_dict" not in str(error):
             raise
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise CheckpointError(
             f"the checkpoint does not fit the network ({reason:.400}), expected the parameters that it was saved with; "
             "if the code of a neuron changed, restore it, or start a new run with --run"
@@ -409,5 +409,5 @@ def fitting_state() -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        reason = f"{type(error).__name__}: {reason_of(error)}"
         raise CheckpointError(f"its state is not one that a run saves ({reason:.200})") from error

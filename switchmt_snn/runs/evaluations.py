@@ -17,7 +17,7 @@ from typing import Any
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol
 from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.numbers import exact
-from switchmt_snn.errors import ConfigError, RunFolderError, printable
+from switchmt_snn.errors import ConfigError, RunFolderError, reason_of
 from switchmt_snn.runs.files import file_name, json_text, write_atomically
 
 CLEARLY_ABOVE = 1.96
@@ -140,7 +140,7 @@ def _read(path: Path) -> dict[str, Any]:
         ArithmeticError, AttributeError, ConfigError, KeyError, OSError, RecursionError, TypeError, ValueError
     ) as error:  # fmt: skip
         raise RunFolderError(
-            f"{path} cannot be read ({printable(str(error)):.80}), expected an evaluation; delete it, or evaluate again"
+            f"{path} cannot be read ({reason_of(error):.80}), expected an evaluation; delete it, or evaluate again"
         ) from error
     return stored
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from switchmt_snn.errors import RunFolderError, printable
+from switchmt_snn.errors import RunFolderError, reason_of
 from switchmt_snn.learning.events import EpisodeEnded, LayerHealth, Measured
 from switchmt_snn.learning.switching import DECISION_COLUMNS
 
@@ -225,7 +225,7 @@ def _parsed(path: Path, rows: Iterator[tuple[int, Any]], parse: Callable[[Any], 
             yield parse(row)
         except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise RunFolderError(
-                f"{path} line {number} cannot be read ({printable(str(error)):.80}), expected a line as training "
+                f"{path} line {number} cannot be read ({reason_of(error):.80}), expected a line as training "
                 "writes it; restore the file from a copy, or delete the line"
             ) from error
 

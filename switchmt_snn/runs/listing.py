@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.config import ExperimentConfig
-from switchmt_snn.errors import RunFolderError, SwitchMTError
+from switchmt_snn.errors import RunFolderError, SwitchMTError, reason_of
 from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, read_history
 
@@ -82,7 +82,7 @@ def list_runs(folder: Path) -> tuple[list[RunSummary], list[Damaged]]:
         try:
             runs.append(summarize(path))
         except (SwitchMTError, OSError) as error:
-            damaged.append(Damaged(path, " ".join(str(error).split())))
+            damaged.append(Damaged(path, reason_of(error)))
     return sorted(runs, key=lambda run: (datetime.fromisoformat(run.created).astimezone(), run.path.name)), damaged
 
 

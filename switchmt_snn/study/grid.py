@@ -17,8 +17,8 @@ from typing import Any
 
 from switchmt_snn.config import ExperimentConfig, differences, from_dict, load_config, resolve, to_dict
 from switchmt_snn.config.checks import require
-from switchmt_snn.config.strict_yaml import parse_yaml, printable, read_text
-from switchmt_snn.errors import ConfigError, did_you_mean
+from switchmt_snn.config.strict_yaml import parse_yaml, read_text
+from switchmt_snn.errors import ConfigError, did_you_mean, printable
 
 MOST_TRIALS = 10_000
 """Of a study; more is a mistake in the grid."""

@@ -14,7 +14,7 @@ from switchmt_snn.config import load_config
 from switchmt_snn.config.numbers import exact, whole_number
 from switchmt_snn.drawing.chart import ticks
 from switchmt_snn.drawing.numbers import bytes_of, compact, duration
-from switchmt_snn.errors import shown
+from switchmt_snn.errors import printable, shown
 from switchmt_snn.export import load_exported, profile, to_nir, to_onnx
 from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.learning.switching import SwitchingPolicy
@@ -63,6 +63,7 @@ EXAMPLES: tuple[Any, ...] = (
     make_environment,
     with_wrapper,
     check_env,
+    printable,
     shown,
     train,
     load_agent,

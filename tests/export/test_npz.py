@@ -33,12 +33,12 @@ def saved(path: Path, **changes: Any) -> Path:
 
 
 def test_a_good_recording_is_read(tmp_path: Path) -> None:
-    read = recording._read(saved(tmp_path / "a.npz"), "a", SUITE)
+    read = recording.read_recording(saved(tmp_path / "a.npz"), "a", SUITE)
     assert np.array_equal(read.observations, GOOD["observations"])
     assert read.actions.tolist() == GOOD["actions"].tolist()
     assert (read.epsilon, read.seed, read.actions.dtype) == (0.05, 7, np.int64)
     fortran = saved(tmp_path / "f.npz", observations=np.asfortranarray(GOOD["observations"]))
-    assert np.array_equal(recording._read(fortran, "a", SUITE).observations, GOOD["observations"])
+    assert np.array_equal(recording.read_recording(fortran, "a", SUITE).observations, GOOD["observations"])
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_a_recording_that_no_run_of_ours_wrote_is_refused(
     changes: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ExportError, match=message) as refused:
-        recording._read(saved(tmp_path / "a.npz", **changes), "a", SUITE)
+        recording.read_recording(saved(tmp_path / "a.npz", **changes), "a", SUITE)
     assert str(refused.value).isprintable()
     assert refused.value.exit_code == 2
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import re
@@ -195,7 +196,7 @@ def _change_node(data: Any, rng: random.Random) -> bool:
     if rng.random() < 0.15 and isinstance(parent, dict):
         parent[rng.choice(("unknown", 1, None, "\x1b[31m", "x" * 300, 1.5, True))] = parent.pop(key)
     else:
-        parent[key] = rng.choice(HOSTILE_VALUES)
+        parent[key] = copy.deepcopy(rng.choice(HOSTILE_VALUES))  # the next change must not change the table
     return True
 
 

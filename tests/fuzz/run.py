@@ -1,15 +1,22 @@
-"""The long campaign: ``python -m tests.fuzz.run config --mutants 10000 --seed 1``; a fault leaves its mutant behind."""
+"""The long campaign: ``python -m tests.fuzz.run config --mutants 10000 --seed 1``; a fault leaves its mutant behind.
+
+``--record results/reliability/campaigns.json`` keeps the counts; ``python -m docs.generate`` makes the table of them.
+"""
 
 from __future__ import annotations
 
 import argparse
 import collections
+import importlib.metadata
+import json
+import platform
 import resource
 import sys
 import tempfile
 import time
 import traceback
 from pathlib import Path
+from typing import Any
 
 from tests.fuzz.formats import FORMATS, mutant_of, outcome
 
@@ -31,12 +38,31 @@ def campaign(name: str, mutants: int, seed: int, kept: Path) -> collections.Coun
     return counts
 
 
+def environment() -> dict[str, str]:
+    """What the campaign ran with."""
+    packages = ("torch", "numpy", "h5py", "onnx", "onnxruntime", "nir")
+    versions = {name: importlib.metadata.version(name) for name in packages}
+    return {
+        "date": time.strftime("%Y-%m-%d"),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+    } | versions
+
+
+def record(path: Path, key: str, row: dict[str, Any]) -> None:
+    """Replace a row of a JSON file."""
+    rows = json.loads(path.read_text()) if path.exists() else {}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(dict(sorted({**rows, key: row}.items())), indent=1) + "\n")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("format", choices=[*FORMATS, "all"])
     parser.add_argument("--mutants", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kept", type=Path, default=Path("fuzz-faults"), help="folder for mutants with a fault")
+    parser.add_argument("--record", type=Path, help="JSON file whose row of the format is replaced")
     options = parser.parse_args()
     faults = 0
     for name in FORMATS if options.format == "all" else [options.format]:
@@ -50,6 +76,16 @@ def main() -> int:
             f"grew by {grown:.0f} MiB"
         )
         faults += counts["fault"]
+        if options.record is not None:
+            row = {
+                "mutants": options.mutants,
+                "seed": options.seed,
+                **{key: counts[key] for key in ("taken", "refused", "fault")},
+                "processor_s": round(seconds),
+                "memory_grew_mib": round(grown),
+                "environment": environment(),
+            }
+            record(options.record, name, row)
     return 1 if faults else 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 from pathlib import Path
 
@@ -28,7 +29,8 @@ def test_a_library_is_built_once_and_again_if_it_is_damaged(tmp_path: Path, monk
     def load() -> Path:
         native_library.library.cache_clear()
         assert native_library.problem() is None
-        (kept,) = (tmp_path / "switchmt_snn").iterdir()
+        kept, summed = sorted((tmp_path / "switchmt_snn").iterdir(), key=lambda path: path.suffix, reverse=True)
+        assert (kept.suffix, summed.suffix) == (".so", ".sha256")
         return kept
 
     try:
@@ -45,6 +47,40 @@ def test_a_library_is_built_once_and_again_if_it_is_damaged(tmp_path: Path, monk
         assert native_library._key(["g++"]) != native_library._key(["g++", "-g"])
     finally:
         native_library.library.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "change", ["cut off", "zeros", "no sum", "other sum", "writable file", "writable folder", "link", "owner"]
+)
+def test_a_kept_library_is_loaded_only_if_it_is_whole_and_this_user_s(
+    change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = tmp_path / "cache" / "native-1.so"
+    previous = os.umask(0)
+    try:
+        native_library._keep(bytes(range(256)), kept)
+    finally:
+        os.umask(previous)
+    assert native_library._is_ours(kept)
+    assert sorted(path.name for path in kept.parent.iterdir()) == ["native-1.sha256", "native-1.so"]
+    if change == "cut off":
+        kept.write_bytes(kept.read_bytes()[:100])
+    elif change == "zeros":
+        kept.write_bytes(bytes(256))
+    elif change == "no sum":
+        kept.with_suffix(".sha256").unlink()
+    elif change == "other sum":
+        kept.with_suffix(".sha256").write_bytes(b"\xff")
+    elif change == "writable file":
+        kept.chmod(0o666)
+    elif change == "writable folder":
+        kept.parent.chmod(0o777)
+    elif change == "link":
+        kept.rename(tmp_path / "elsewhere.so")
+        kept.symlink_to(tmp_path / "elsewhere.so")
+    else:
+        monkeypatch.setattr(os, "getuid", lambda: 12345)
+    assert not native_library._is_ours(kept)
 
 
 def test_a_missing_and_a_failing_compiler_give_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
