@@ -247,13 +247,15 @@ class TrialRun:
         """The evaluation with which the training ended (``step``, ``protocol``, ``tasks``, ``file``); None before that.
 
         A run ends at ``total_steps``, or when ``evaluation.stop_at_returns`` is reached; then other episodes are
-        played, those of the next seed.
+        played, those of the next seed. A run whose checkpoints were left out, to keep its numbers only, ended at its
+        last evaluation.
         """
         config = self.config
         if config is None:
             return None
         evaluation = config.evaluation
-        last = max((_step_of(path.name) for path in (self.path / "checkpoints").glob("step-*")), default=-1)
+        stored = [_step_of(path.name) for path in (self.path / "checkpoints").glob("step-*")]
+        last = max(stored or [one["step"] for one in self.folder.evaluations.all()], default=-1)
         if last < config.total_steps and not evaluation.stop_at_returns:
             return None
         seed = evaluation.seed if last >= config.total_steps else evaluation.seed + 1

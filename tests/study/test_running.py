@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,6 +112,11 @@ def test_a_study_that_is_killed_goes_on_as_if_it_had_not_been(tmp_path: Path) ->
     code, out = ended(begin(tmp_path / "killed", cwd=tmp_path))  # the folder itself is a study, too
     assert code == 0, out
     assert "2 finished" in out
+    shutil.rmtree(tmp_path / "killed" / "trials" / "timesteps-1_seed1" / "checkpoints")  # a study of numbers only
+    code, out = ended(begin(tmp_path / "killed", cwd=tmp_path))
+    assert code == 0, out
+    assert "2 finished" in out
+    assert not list((tmp_path / "killed" / "trials" / "timesteps-1_seed1" / "checkpoints").glob("step-*"))
     code, out = ended(begin(path, "--folder", "whole", cwd=tmp_path))
     assert code == 0, out
     for name in ("tables.md", "study.json", "trials.csv", "scores.csv", "curves.csv"):
