@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from switchmt_snn.cli.parsing import parse, split_one
+from switchmt_snn.cli.parsing import for_named_tasks, parse, split_one
 from switchmt_snn.config import ExperimentConfig, load_config
 from switchmt_snn.viewing import output
 
@@ -25,7 +25,7 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     flagless = DescribeOptions(experiment=ExperimentConfig())
     source, rest = split_one(DescribeOptions, argv, "describe", flagless)
-    default = load_config(source or "quickstart")
+    default = for_named_tasks(load_config(source or "quickstart"), rest)
     options = parse(DescribeOptions, rest, "describe", DescribeOptions(experiment=default))
     from switchmt_snn.machine.memory import available_bytes
     from switchmt_snn.runs.description import describe

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
+from dataclasses import replace
 from typing import Any
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from switchmt_snn.config import presets
+from switchmt_snn.config import ExperimentConfig, presets
 from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
 
@@ -180,6 +182,29 @@ def peek(argv: list[str], flag: str) -> str | None:
         if word.startswith(f"{flag}="):
             return word.split("=", 1)[1]
     return None
+
+
+def for_named_tasks(config: ExperimentConfig, argv: list[str]) -> ExperimentConfig:
+    """A config without its returns by task if flags name other tasks: they would end the training of those.
+
+    Args:
+        config: that flags will change.
+        argv: the flags.
+    """
+    flag = "--tasks.names"
+    if not any(word == flag or word.startswith(f"{flag}=") for word in argv):
+        return config
+    start = next(index for index, word in enumerate(argv) if word.partition("=")[0] == flag)
+    _, equals, first = argv[start].partition("=")
+    following = itertools.takewhile(lambda word: not word.startswith("--"), argv[start + 1 :])
+    named = (first,) if equals else tuple(following)
+    if named == config.tasks.names:
+        return config
+    return replace(
+        config,
+        evaluation=replace(config.evaluation, stop_at_returns=()),
+        switching=replace(config.switching, reference_scores=(), floor_scores=()),
+    )
 
 
 RENAMED = {"evaluate": {"--engine": "--runtime"}, "export": {"--nir-profile": "--nir-dialect"}}

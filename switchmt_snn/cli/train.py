@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from switchmt_snn.cli.parsing import parse, peek, split_one
+from switchmt_snn.cli.parsing import for_named_tasks, parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.machine.program import program, runnable
@@ -36,7 +36,7 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     source, rest = split_one(TrainOptions, argv, "train", TrainOptions(experiment=ExperimentConfig()))
     run = peek(rest, "--run")
-    default = _starting_config(source, run)
+    default = for_named_tasks(_starting_config(source, run), rest)
     options = parse(TrainOptions, rest, "train", TrainOptions(experiment=default))
     if source is None and options.run is not None:
         from switchmt_snn.runs.folder import RunFolder

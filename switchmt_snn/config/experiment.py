@@ -74,7 +74,7 @@ class ExperimentConfig:
             len(goals) in (0, len(names)),
             "evaluation.stop_at_returns",
             list(goals),
-            f"a return for each of {list(names)}",
+            f"a return for each of {list(names)}, or none",
         )
         stack = resolved_frame_stack(self.tasks)
         per_env = self.learning.replay_capacity_steps // self.tasks.num_envs

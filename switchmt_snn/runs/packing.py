@@ -75,7 +75,8 @@ def refuse_pretrained(run: str | Path) -> None:
         config = shlex.quote(str(PRETRAINED / name / "config.yaml"))
         raise RunFolderError(
             f"{run} comes with the package and holds weights only, expected a run with its replay; it can be "
-            f"evaluated, exported and profiled; training needs a new run: switchmt-snn train {config} --run NEW_FOLDER"
+            f"evaluated, exported and profiled; training needs a new run: switchmt-snn train {config} "
+            f"--initial-weights pretrained/{name} --run NEW_FOLDER"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from switchmt_snn import load_config, train
 from switchmt_snn.cli import main
@@ -68,3 +69,17 @@ def test_a_printed_config_can_be_varied(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit) as stop:
         main(["train", str(path), "--network.method", "DQN", "--print-config"])
     assert stop.value.code == 0
+
+
+@pytest.mark.parametrize("words", [["--tasks.names", "MountainCar-v0"], ["--tasks.names=MountainCar-v0", "--seed=2"]])
+def test_the_goals_of_a_presets_tasks_do_not_end_the_training_of_others(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def goals(*more: str) -> list[float]:
+        with pytest.raises(SystemExit):
+            main(["train", "cartpole", "--print-config", *more])
+        return list(yaml.safe_load(capsys.readouterr().out)["evaluation"]["stop_at_returns"])
+
+    assert goals() == goals("--tasks.names", "CartPole-v1") == [485]
+    assert goals(*words) == []
+    assert goals(*words, "--evaluation.stop-at-returns", "-110") == [-110]
