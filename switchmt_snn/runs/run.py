@@ -14,7 +14,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, EvaluationStopped, evaluate_agent
 from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, load_config, to_dict
 from switchmt_snn.config.plugins import plugin_name
-from switchmt_snn.errors import TrainingFailed
+from switchmt_snn.errors import CheckpointError, TrainingFailed
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.switching import Criterion, with_policy
@@ -26,6 +26,7 @@ from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_state, fitting_weights
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
+from switchmt_snn.runs.history import read_history
 from switchmt_snn.runs.initial_weights import InitialWeights, read_initial_weights
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.packing import open_run, refuse_pretrained
@@ -265,6 +266,7 @@ class _Driver:
     def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
         """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""
         if not self.store.paths():
+            self._require_no_progress()
             if self.initial is None:
                 return None, None, []
             self.initial.give(self.training.learner)
@@ -281,6 +283,19 @@ class _Driver:
                 "exactly as it would have without the interruption"
             )
         return loaded.log_sizes, loaded.step, notes
+
+    def _require_no_progress(self) -> None:
+        """Refuse to begin anew over the logs of a run that has had a checkpoint: after two periods it had.
+
+        Raises:
+            CheckpointError: its checkpoints are gone.
+        """
+        reached = read_history(self.folder.path, self.training.suite.names).last_step
+        if reached >= 2 * self.config.recording.checkpoint_every_steps:
+            raise CheckpointError(
+                f"{self.store.folder} has no checkpoint, expected one of a run whose logs reach step {reached:,}; put "
+                "it back, or begin another run with --run"
+            )
 
     def _record(self, step: int, requested: Callable[[], bool]) -> None:
         """Save and evaluate when a border of their periods was crossed by the last vector step."""

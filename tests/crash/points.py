@@ -36,9 +36,11 @@ learning: {batch_size: 4, learning_starts_steps: 20, replay_capacity_steps: 300,
 evaluation: {episodes: 2, epsilon: 0.0, every_steps: 120, max_episode_steps: 60}
 recording: {checkpoint_every_steps: 80, metrics_every_steps: 100, keep_checkpoints: 2}
 """
+BY_RETURNS = ("--evaluation.every-steps", "None", "--total-steps", "800")
+"""Longer, so that the task has the episodes by which weights are judged."""
 COMMANDS: dict[str, tuple[str, ...]] = {
     "train": ("train", "CONFIG", "--run", "RUN"),
-    "train, best by returns": ("train", "CONFIG", "--run", "RUN", "--evaluation.every-steps", "null"),
+    "train, best by returns": ("train", "CONFIG", "--run", "RUN", *BY_RETURNS),
     "evaluate": ("evaluate", "RUN", "--episodes", "3"),
     "export": ("export", "RUN", "--parity-decisions", "8"),
     "profile": ("profile", "RUN", "--decisions", "8"),

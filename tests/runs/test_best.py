@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, summa
 from switchmt_snn.cli import main
 from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.yaml_io import from_dict, to_yaml
+from switchmt_snn.errors import CheckpointError
 from switchmt_snn.runs.best import rise_above_random
 from switchmt_snn.runs.checkpoint import Best, CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
@@ -50,6 +52,15 @@ def test_without_evaluations_they_are_chosen_by_training_returns(tmp_path: Path)
     best = CheckpointStore(tmp_path / "run" / "checkpoints").best()
     assert best is not None
     assert (best.judged_by, best.step % 200) == ("returns", 0)
+
+
+def test_a_run_whose_checkpoints_are_gone_does_not_begin_anew(tmp_path: Path) -> None:
+    train(from_dict({**CARTPOLE, "evaluation": {"episodes": 1}}), tmp_path / "run")
+    log = (tmp_path / "run" / "episodes.csv").read_bytes()
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    with pytest.raises(CheckpointError, match=r"has no checkpoint, expected one of a run whose logs reach step \d+"):
+        train(run=tmp_path / "run")
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() == log
 
 
 def test_a_score_of_another_kind_is_not_compared(tmp_path: Path) -> None:
