@@ -28,6 +28,7 @@ from switchmt_snn.export.npz import read_npz
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.runtimes.agents import read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.spiking.encodings import ENCODINGS, make_encoding
 from switchmt_snn.spiking.layers import Conv, Dense, convolved_sides
 
@@ -91,11 +92,13 @@ def count_nir(path: Path, observations: Path, reset: str | None = None, fires_at
     layers = _layers(interpreter, inputs)
     record = {name for layer in layers for name in (layer.source, layer.spiking) if name is not None}
     record.discard(interpreter.input)
-    for batch_TB in inputs.batches:
-        _, recorded = interpreter.run(batch_TB, sorted(record))
-        recorded[interpreter.input] = batch_TB[:1] if inputs.once else batch_TB
-        for layer in layers:
-            layer.add(recorded)
+    with progress_of(f"counting {path.name}", inputs.decisions, "decisions") as progress:
+        for batch_TB in inputs.batches:
+            _, recorded = interpreter.run(batch_TB, sorted(record))
+            recorded[interpreter.input] = batch_TB[:1] if inputs.once else batch_TB
+            for layer in layers:
+                layer.add(recorded)
+            progress.advance(batch_TB.shape[1])
     task = str(graph.metadata.get("task", path.stem))
     counts = TaskCounts(task, inputs.decisions, inputs.timesteps, True, tuple(layer.counts() for layer in layers))
     known = reset is not None or "reset" in graph.metadata

@@ -23,6 +23,7 @@ from switchmt_snn.export.formats.nir_writer import nir_graph, write_nir
 from switchmt_snn.export.parity.dyadic import dyadic_observations, exact_copy
 from switchmt_snn.export.runtimes.agents import encode
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
+from switchmt_snn.machine.progress import Work, listening
 from tests.export.export_cases import VARIANTS, make_agent, observations
 
 
@@ -179,6 +180,32 @@ def test_own_files_count_like_the_network(variant: str, exported, tmp_path: Path
     for mine, theirs in zip(seen.layers, expected.layers, strict=True):
         # The file has the gains folded into its weights.
         assert vars(mine) == vars(theirs) | {"gain_multiplications_per_decision": 0}
+
+
+class Heard:
+    """Keeps what a piece of work was called and how far it came."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, int, int]] = []
+
+    def begun(self, work: Work) -> None:
+        self.advanced(work)
+
+    def advanced(self, work: Work) -> None:
+        self.said.append((work.what, work.done, work.total))
+
+    def ended(self, work: Work) -> None:
+        self.advanced(work)
+
+
+def test_counting_says_how_far_it_is(exported, tmp_path: Path) -> None:
+    _, x, path = exported("T 1")
+    heard = Heard()
+    with listening(heard):
+        counted(path, saved(tmp_path / "x.npz", observations=x))
+    assert heard.said[0] == (f"counting {path.name}", 0, 40)
+    assert heard.said[-1] == (f"counting {path.name}", 40, 40)
+    assert 0 < heard.said[1][1] < 40, "it is told between the chunks"
 
 
 @pytest.mark.parametrize(("variant", "profile"), [("LIF", "legacy"), ("subtract", "legacy"), ("LIF", "spikingjelly")])
