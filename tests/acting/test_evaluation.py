@@ -139,6 +139,7 @@ def test_one_task_and_unknown_tasks() -> None:
         evaluate_agent(agent, PROTOCOL, ("astrix",))
 
 
+@pytest.mark.slow
 def test_agent_acts_on_one_observation_and_on_batches() -> None:
     agent = minatar_agent()
     batch = np.random.default_rng(0).integers(0, 2, (5, *agent.suite.observation_shape)).astype(np.uint8)

@@ -48,6 +48,7 @@ def test_describe_gives_the_seven_counts(capsys) -> None:
         assert sum(layer["parameters"] for layer in facts["layers"]) == facts["trainable_parameters"]
 
 
+@pytest.mark.slow
 def test_describe_shows_the_configs_own_network(capsys) -> None:
     """An ablation is described as it is, and every method under settings that only some can have."""
     _, out, _ = call(capsys, "describe", "--network.dendrites", "none", "--json")
@@ -60,6 +61,7 @@ def test_describe_shows_the_configs_own_network(capsys) -> None:
     assert counts["DQN"] == TABLE_3["DQN"]
 
 
+@pytest.mark.slow
 def test_describe_gives_spiking_methods_their_steps_where_the_configs_method_is_an_ann(capsys, tmp_path: Path) -> None:
     """T is of the method that is described: in the config, by a flag, and from a run's resolved config."""
     _, out, _ = call(capsys, "describe", "--json")
@@ -86,6 +88,7 @@ def test_describe_says_which_config_and_takes_the_one_that_train_takes(capsys) -
     assert (json.loads(out)["config"], json.loads(out)["source"]) == ("minatar", "minatar")
 
 
+@pytest.mark.slow
 def test_describe_names_trained_and_deployed_parameters(capsys) -> None:
     """32 quantiles add 31 times the heads in training; what decides has the paper's count."""
     flags = ["describe", "--network.quantiles", "32", "--learning.loss", "huber"]
@@ -311,6 +314,7 @@ def test_gym_tasks_from_a_file(tmp_path: Path, capsys) -> None:
     assert "Acrobot-v1" in out
 
 
+@pytest.mark.slow
 def test_best_weights_are_kept_and_can_be_evaluated(tmp_path: Path, capsys) -> None:
     run = tmp_path / "run"
     flags = [word if word != "240" else "900" for word in SMALL]

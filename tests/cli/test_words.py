@@ -134,6 +134,7 @@ def test_a_printed_command_runs(tmp_path: Path) -> None:
     assert "usage: switchmt-snn evaluate [RUN]" in again.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "utf-8"])
 def test_streams_of_any_encoding_take_every_character(encoding: str, tmp_path: Path) -> None:
     code = (

@@ -133,6 +133,7 @@ def test_every_field_is_documented() -> None:
             assert len(documentation) > 10, key
 
 
+@pytest.mark.slow
 def test_generated_pages_are_up_to_date() -> None:
     from docs.tools.pages import PAGES
 

@@ -32,6 +32,7 @@ def programs() -> dict[str, str]:
     return {re.match(r'"""python (\S+)', block).group(1): block for block in blocks}
 
 
+@pytest.mark.slow
 def test_a_host_without_torch_and_without_this_package_plays_pong(tmp_path: Path) -> None:
     agent = make_agent(tasks={"suite": "atari", "names": ["breakout", "pong"]}, trunk="nature")
     write_atomically(tmp_path / "decision.onnx", decision_model(fold_agent(agent)).SerializeToString())

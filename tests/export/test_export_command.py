@@ -109,6 +109,7 @@ def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: R
     assert "parity.json cannot be read" in err
 
 
+@pytest.mark.slow
 def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(trained_run: Path, run_command: RunCommand) -> None:
     run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
     run_command("train", "--run", trained_run, "--total-steps", 620)
@@ -160,6 +161,7 @@ def test_the_same_from_python(trained_run: Path) -> None:
         check_parity(bare)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", [(np, "savez_compressed"), (export_run, "write_nir")])
 def test_two_exports_of_one_run_at_once_do_not_meet(
     trained_run: Path, monkeypatch: pytest.MonkeyPatch, written: tuple[Any, str]

@@ -106,6 +106,7 @@ def test_hdf5_that_reaches_elsewhere_or_is_too_large(nir_file: Path, change: str
     refuse_nir(nir_file, reason)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "reason"),
     [
@@ -206,6 +207,7 @@ def nested(levels: int) -> onnx.NodeProto:
 IDENTITY = helper.make_node("Identity", ["x"], ["y"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "reason"),
     [

@@ -48,6 +48,7 @@ def snntorch_file(tmp_path: Path) -> tuple[Path, Path, np.ndarray]:
     return tmp_path / "snn.nir", tmp_path / "x.npz", outputs_TB
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_file_of_snntorch_runs_as_in_snntorch_with_its_reset(snntorch_file, run_command: RunCommand) -> None:
     """Its default subtracts after the decay; subtracting at the spike, or resetting to zero, gives other spikes."""

@@ -216,6 +216,7 @@ def test_other_profiles_count_the_same(variant: str, profile: str, exported, tmp
     assert [layer.spikes_T for layer in seen.layers] == [layer.spikes_T for layer in expected.layers]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["SwitchMT", "latency", "frames"])
 def test_encoded_inputs_count_like_raw_observations(variant: str, exported, tmp_path: Path) -> None:
     agent, x, path = exported(variant)
@@ -327,6 +328,7 @@ def refused(path: Path, observations: Path, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_bad_observations_are_refused_in_one_line(tmp_path: Path, exported) -> None:
     _, x, path = exported("SwitchMT", count=4)
     stored = tmp_path / "x.npz"
@@ -359,6 +361,7 @@ def test_bad_observations_are_refused_in_one_line(tmp_path: Path, exported) -> N
         refused(path, saved(stored, inputs=encoded, dt=dt), "dt is .*, expected one number above 0")
 
 
+@pytest.mark.slow
 def test_bad_graphs_are_refused_in_one_line(tmp_path: Path) -> None:
     path, inputs = tmp_path / "graph.nir", np.ones((2, 3, 2, 6, 5), np.float32)
     stored = saved(tmp_path / "x.npz", inputs=inputs)

@@ -133,6 +133,7 @@ def trained(config: str) -> Path:
     return train(loaded, "run").path
 
 
+@pytest.mark.slow
 def test_an_encoding_without_an_onnx_rule_is_profiled_and_exported_to_nir(
     recipes: Path, run_command: RunCommand
 ) -> None:
@@ -152,6 +153,7 @@ def test_an_encoding_without_an_onnx_rule_is_profiled_and_exported_to_nir(
     assert "ONNX has no rule" in err
 
 
+@pytest.mark.slow
 def test_an_own_neuron_without_rules_is_counted_and_no_format_is_said_to_fit(
     recipes: Path, run_command: RunCommand
 ) -> None:
@@ -167,6 +169,7 @@ def test_an_own_neuron_without_rules_is_counted_and_no_format_is_said_to_fit(
     assert "--nir" not in err
 
 
+@pytest.mark.slow
 def test_an_own_neuron_with_rules_is_exported_compared_and_counted(recipes: Path, run_command: RunCommand) -> None:
     run = trained("exported_neuron.yaml")
     out, _ = run_command("export", run, "--parity-decisions", 20)

@@ -119,6 +119,7 @@ def test_wrong_observations_are_refused() -> None:
             count_task(agent, 0, wrong)
 
 
+@pytest.mark.slow
 def test_profile_command(trained_run: Path, run_command: RunCommand) -> None:
     out, _ = run_command("profile", trained_run, "--decisions", 50)
     assert "breakout: per decision, mean of 52" in out
@@ -217,6 +218,7 @@ def test_long_profiles_count_while_they_play(trained_run: Path, monkeypatch: pyt
     assert [task["precision"][0]["decisions"] for task in streamed] == [40, 40]
 
 
+@pytest.mark.slow
 def test_a_network_without_a_voice_and_an_ann_say_so(trained_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = load_agent(trained_run, "last", "cpu")
     with torch.no_grad():

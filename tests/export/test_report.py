@@ -131,6 +131,7 @@ def test_a_number_that_is_not_in_profile_json_would_be_noticed(profiled: Path, t
         check(tmp_path / "changed.html", facts)
 
 
+@pytest.mark.slow
 def test_several_runs_in_one_report(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     shutil.rmtree(trained_run / "profile", ignore_errors=True)
     _, err = run_command("profile", trained_run, tmp_path / "nothing", code=2)

@@ -30,6 +30,7 @@ def with_decays(agent: Agent, betas: tuple[float, ...]) -> Agent:
     return agent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reset", ["zero", "subtract"])
 def test_the_exact_copy_fits_where_the_network_does_whatever_decays_were_learned(reset: str) -> None:
     """Learned decays leave [0, 1] (neurons clamp them), and streams have one each; the trunk here is one layer."""
@@ -102,6 +103,7 @@ def test_nothing_is_written_where_a_format_that_was_asked_for_does_not_fit(
     assert not list((trained_run / "export").glob("*")), "ONNX was not written either"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ExportError("no copy")])
 def test_files_that_could_not_be_compared_do_not_stay(
     error: BaseException, trained_run: Path, monkeypatch: pytest.MonkeyPatch

@@ -23,6 +23,7 @@ BUDGET = {"config": 150, "study": 40, "target": 100, "task-id": 200, "manifest":
 """Mutants of a format here; 40 of the others, which take a run's folder or a child process each."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_mutants_are_taken_or_refused_by_one_line(name: str, tmp_path: Path) -> None:
     @settings(max_examples=BUDGET.get(name, 40), deadline=None, suppress_health_check=list(HealthCheck))
@@ -33,6 +34,7 @@ def test_mutants_are_taken_or_refused_by_one_line(name: str, tmp_path: Path) -> 
     one()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_good_files_are_taken(name: str, tmp_path: Path) -> None:
     taken = {seed: outcome(name, tmp_path, content) for seed, content in FORMATS[name].seeds.items()}
@@ -54,6 +56,7 @@ def test_every_file_of_the_corpus_has_its_line() -> None:
         assert {path.name for path in (CORPUS / name).iterdir()} == set(EXPECTED[name])
 
 
+@pytest.mark.slow
 def test_the_campaign_counts_and_keeps_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader that raises anything but an error of ours is a fault: the fuzzer can fail."""
     from tests.fuzz import formats

@@ -64,6 +64,7 @@ def deficit_policy(**settings: object) -> SwitchingPolicy:
     return SwitchingPolicy(SwitchingConfig(policy="deficit", **(base | settings)), 3)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_steps_follow_the_shares_whatever_the_lengths_of_episodes() -> None:
     """Deficits 0.9, 0.5, 0 with temperature 0.5: shares as exp(1.8), exp(1), exp(0)."""
     policy = deficit_policy(deficit_temperature=0.5)
@@ -119,6 +120,7 @@ def progress_policy(**settings: object) -> SwitchingPolicy:
     return SwitchingPolicy(SwitchingConfig(policy="learning_progress", **(base | settings)), 3)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_learning_progress_plays_what_changes_up_or_down() -> None:
     """A task that rises, one that falls at half the speed, a constant one: 2 : 1 : 0 beside 20 % for all."""
     policy = progress_policy(reference_scores=(100.0, 100.0, 100.0))
@@ -255,6 +257,7 @@ def test_value_change_counts_neither_updates_nor_parameters() -> None:
     assert policy.criterion.probe is None, "a new probe in the next visit"
 
 
+@pytest.mark.slow
 def test_the_values_of_a_training_are_its_networks_and_looking_changes_nothing() -> None:
     from switchmt_snn.learning.training import Training
 

@@ -39,6 +39,7 @@ def chosen(longest: int, epsilon: float, steps: int) -> tuple[np.ndarray[Any, An
     return np.stack(explores), np.stack(actions)
 
 
+@pytest.mark.slow
 def test_durations_follow_the_zeta_distribution() -> None:
     """With epsilon 1 an action begins when the last one ends; equal neighbours are rare with many actions."""
     part, rng = Exploration(1, 1, 20), np.random.default_rng(0)
@@ -77,6 +78,7 @@ def test_copies_and_tasks_are_held_apart_and_an_episodes_end_ends_it() -> None:
     assert not part.choose(0, VALID, 0.0, rng)[0].any()
 
 
+@pytest.mark.slow
 def test_an_episodes_end_in_training_ends_it() -> None:
     part = training(longest_random_action_steps=1000)
     held = []
@@ -89,6 +91,7 @@ def test_an_episodes_end_in_training_ends_it() -> None:
     assert all(left == 0 for length, left in held if length == 0)
 
 
+@pytest.mark.slow
 def test_a_run_continues_exactly() -> None:
     assert_continues_exactly(lambda: training(longest_random_action_steps=30), at_steps=(61, 155))
 

@@ -36,6 +36,7 @@ def played(mean: str = "input", engine: str = "eager") -> Training:
     return part
 
 
+@pytest.mark.slow
 @engines
 def test_running_means_are_the_mean_currents_of_the_present_weights(engine: str) -> None:
     part = played(engine=engine)
@@ -63,10 +64,12 @@ def lag(mean: str) -> torch.Tensor:
     return (layer.normalization.running_mean_KC[1] - current).abs().mean().detach()
 
 
+@pytest.mark.slow
 def test_running_means_of_currents_lag_further_behind() -> None:
     assert lag("input") < 0.7 * lag("running")
 
 
+@pytest.mark.slow
 def test_the_target_network_takes_them() -> None:
     part = played()
     part.learner.copy_target()
@@ -74,6 +77,7 @@ def test_the_target_network_takes_them() -> None:
     assert torch.equal(ours.running_mean_KC, target.running_mean_KC)
 
 
+@pytest.mark.slow
 @engines
 def test_a_run_continues_exactly(engine: str) -> None:
     assert_continues_exactly(lambda: training(engine=engine), at_steps=(61, 155))

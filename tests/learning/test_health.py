@@ -26,6 +26,7 @@ def training(network: dict[str, Any] | None = None, tasks: int = 2, **learning: 
     return Training(config, suite, torch.device("cpu"))
 
 
+@pytest.mark.slow
 def test_health_is_drawn_from_the_whole_replay_of_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
     part = training()
     for _ in part.events():
@@ -46,6 +47,7 @@ def test_health_is_drawn_from_the_whole_replay_of_the_task(monkeypatch: pytest.M
     assert not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_measuring_changes_nothing_in_training() -> None:
     often, never = training(), training()
     never.metrics_clock.period_steps = 10**9
@@ -58,6 +60,7 @@ def test_measuring_changes_nothing_in_training() -> None:
     assert torch.equal(often.learner.generator.get_state(), never.learner.generator.get_state())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("momentum", "every", "per_round", "first"),
     [(0.1, 1, 1, 20 + 44), (0.3, 1, 1, 20 + 13), (0.3, 2, 3, 20 + 10), (1.0, 1, 1, 20 + 1)],
@@ -76,6 +79,7 @@ def test_no_health_before_the_running_statistics_have_left_their_initial_values(
     assert min(shown) == -(-first // 10) * 10
 
 
+@pytest.mark.slow
 def test_a_network_without_normalization_has_health_from_the_end_of_the_warm_up() -> None:
     part = training(tasks=1)
     assert updates_to_settle(part.learner.network) == 0

@@ -43,6 +43,7 @@ def training(terminal: bool) -> Training:
 CPU = torch.device("cpu")
 
 
+@pytest.mark.slow
 def test_sums_stop_at_a_lost_life_and_equal_the_naive_ones() -> None:
     """Frames say the step t (reward t + 1) and the episode's seed (odd ones terminate at the end)."""
     part = training(terminal=True)
@@ -72,6 +73,7 @@ def test_sums_stop_at_a_lost_life_and_equal_the_naive_ones() -> None:
     assert compared > 150
 
 
+@pytest.mark.slow
 def test_stacks_returns_and_episodes_are_those_without_the_setting() -> None:
     with_it, without = training(terminal=True), training(terminal=False)
     logs: list[list[Any]] = [[e for e in part.events() if isinstance(e, EpisodeEnded)] for part in (with_it, without)]

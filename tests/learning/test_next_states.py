@@ -35,6 +35,7 @@ def played(engine: str, **learning: Any) -> Training:
     return part
 
 
+@pytest.mark.slow
 @engines
 @pytest.mark.parametrize("double_q", [True, False])
 def test_next_states_are_normalized_by_the_batch_and_leave_no_trace(engine: str, double_q: bool) -> None:
@@ -55,6 +56,7 @@ def test_next_states_are_normalized_by_the_batch_and_leave_no_trace(engine: str,
         torch.testing.assert_close(learner.network.get_buffer(name), value, rtol=1e-4, atol=1e-6, msg=name)
 
 
+@pytest.mark.slow
 @engines
 def test_the_target_s_statistics_do_not_move(engine: str) -> None:
     part = played(engine, next_statistics="batch")
@@ -65,6 +67,7 @@ def test_the_target_s_statistics_do_not_move(engine: str) -> None:
         assert torch.equal(value, before[name]), name
 
 
+@pytest.mark.slow
 @engines
 @pytest.mark.parametrize("whose", ["online", "target"])
 def test_training_acts_by_the_network_that_is_named(engine: str, whose: str) -> None:
@@ -80,6 +83,7 @@ def test_training_acts_by_the_network_that_is_named(engine: str, whose: str) -> 
     assert (learner.act(observations, 1) == greedy[whose]).all()
 
 
+@pytest.mark.slow
 @engines
 def test_a_run_with_both_continues_exactly(engine: str) -> None:
     assert_continues_exactly(
@@ -87,6 +91,7 @@ def test_a_run_with_both_continues_exactly(engine: str) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("double_q", "copies"), [(True, 2), (False, 1)])
 def test_only_statistics_that_a_pass_moves_are_copied(
     double_q: bool, copies: int, monkeypatch: pytest.MonkeyPatch

@@ -100,6 +100,7 @@ def test_an_update_is_that_of_the_formula(double_q: bool) -> None:
     assert means["q"] == pytest.approx(float(np.mean(predicted)), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_quantiles_of_a_random_reward_are_learned() -> None:
     """The reward is 10 with probability 1/4, else 0: one quantile in four is near 10, and their mean is near 2.5."""
     config = quantile_config(16, network={"method": "DQN", "hidden_units": 32}, learning={"learning_rate": 0.01})

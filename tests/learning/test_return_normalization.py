@@ -105,6 +105,7 @@ def test_a_scale_divides_the_gradient_of_huge_errors() -> None:
     assert gradients[0] == pytest.approx(10.0 * gradients[1], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_each_task_has_the_scale_of_its_own_returns() -> None:
     """Rewards are 1 to 7 within an episode; without a discount they are the returns."""
     part = played(discount=0.0)
@@ -115,10 +116,12 @@ def test_each_task_has_the_scale_of_its_own_returns() -> None:
         assert part.learner._scale_K[task].item() == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_clipped_rewards_have_the_scale_of_clipped_rewards() -> None:
     assert [scale.value for scale in played(discount=0.0, clip_rewards=True).return_scales] == [1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_a_truncated_return_ends_with_its_episode() -> None:
     """Half of the episodes are truncated: 7 steps of 1 to 7 whatever ends them."""
     part = played(discount=1.0, copies=4)
@@ -128,6 +131,7 @@ def test_a_truncated_return_ends_with_its_episode() -> None:
         assert scale.value == pytest.approx(math.sqrt(sum(value**2 for value in sums) / 7), rel=0.05)
 
 
+@pytest.mark.slow
 def test_without_the_setting_errors_are_divided_by_one() -> None:
     part = played(return_normalization="none")
     assert part.return_scales == []

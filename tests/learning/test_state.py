@@ -107,6 +107,7 @@ def test_what_does_not_fit_is_one_line(state: dict[str, Any], damage: Damage, me
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_run_without_first_layer_means_does_not_continue_with_them() -> None:
     with pytest.raises(CheckpointError, match="has no first_layer of Learner, expected what it saves"):
         training().load_state_dict(played(first_layer_mean="running"))

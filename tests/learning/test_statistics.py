@@ -48,6 +48,7 @@ def layers(network: QNetwork) -> list[TaskBatchNorm]:
     return [module for module in network.modules() if isinstance(module, TaskBatchNorm)]
 
 
+@pytest.mark.slow
 def test_statistics_are_the_means_over_batches_of_the_replay() -> None:
     part = played(0)
     network, naive = part.learner.network, copy.deepcopy(part.learner.network)
@@ -67,6 +68,7 @@ def test_statistics_are_the_means_over_batches_of_the_replay() -> None:
         assert layer.momentum == 0.1
 
 
+@pytest.mark.slow
 def test_nothing_but_the_task_s_statistics_changes() -> None:
     part = played(0)
     network = part.learner.network
@@ -102,6 +104,7 @@ def changed_tasks(network: QNetwork, before: dict[str, torch.Tensor]) -> set[int
     return changed[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [0, 1])
 def test_a_visit_starts_with_fresh_statistics_of_its_task(task: int) -> None:
     part = updated()
@@ -111,6 +114,7 @@ def test_a_visit_starts_with_fresh_statistics_of_its_task(task: int) -> None:
     assert changed_tasks(part.learner.target, before[1]) == set()
 
 
+@pytest.mark.slow
 def test_the_target_network_is_copied_with_fresh_statistics_of_all_tasks() -> None:
     part = updated()
     fresh = part.settled_acting_network().state_dict()
@@ -133,6 +137,7 @@ def test_estimating_twice_at_a_step_gives_the_same_statistics_and_draws_nothing_
     assert torch.equal(part.learner.generator.get_state(), draws[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["eager", pytest.param("native", marks=builds)])
 def test_a_run_with_fresh_statistics_continues_exactly(engine: str) -> None:
     assert_continues_exactly(lambda: training(3, engine), at_steps=(61, 155))

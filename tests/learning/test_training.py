@@ -88,6 +88,7 @@ def test_batches_never_mix_tasks_or_cross_episodes(num_envs: int, update_tasks: 
         replay.check_valid()
 
 
+@pytest.mark.slow
 def test_steps_episodes_and_updates_add_up() -> None:
     training = counting(small_config(total_steps=402, tasks={"num_envs": 3}, learning={"update_every_steps": 4}))
     events = run(training)
@@ -106,6 +107,7 @@ def test_steps_episodes_and_updates_add_up() -> None:
     assert due - 2 * -(-21 // 3) <= training.learner.updates < due
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("update_tasks", ["current", "all"])
 def test_no_task_is_left_by_a_judgement_on_learning_before_its_own_first_update(update_tasks: str) -> None:
     """Episodes of 7 steps, a replay that is sampled from 40 transitions on, windows of 2 episodes."""
@@ -263,6 +265,7 @@ def test_every_method_learns_the_identity_task(method: str) -> None:
     assert training.learner.act(np.eye(3, dtype=np.float32), 0).tolist() == [0, 1, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_stay_steps", [None, 30])
 def test_the_policy_sees_every_episode_end_of_a_step_in_which_it_leaves(
     max_stay_steps: int | None, monkeypatch
@@ -338,6 +341,7 @@ def golden_run() -> dict[str, Any]:
     return {"losses": losses, "spikes": spikes}
 
 
+@pytest.mark.slow
 def test_golden_run() -> None:
     """On the processor that recorded it: bitwise. Elsewhere rounding differs: the first updates to rounding."""
     golden = json.loads(GOLDEN.read_text())

@@ -21,6 +21,7 @@ def training(**learning: Any) -> Training:
     return Training(small_config(learning=learning), suite, torch.device("cpu"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [False, True])
 @pytest.mark.parametrize("update_tasks", ["current", "all"])
 def test_a_round_makes_its_number_of_updates_for_each_of_its_tasks(update_tasks: str, overlap: bool) -> None:
@@ -39,6 +40,7 @@ def test_a_round_makes_its_number_of_updates_for_each_of_its_tasks(update_tasks:
     assert part.learner.updates % 5 == 0
 
 
+@pytest.mark.slow
 def test_one_round_of_many_updates_is_not_many_rounds_of_one() -> None:
     """Both make the same number of updates; within a round nothing new is played."""
     often, seldom = training(update_every_steps=1), training(update_every_steps=50, updates_per_round=50)
@@ -49,6 +51,7 @@ def test_one_round_of_many_updates_is_not_many_rounds_of_one() -> None:
     assert not torch.equal(often.learner.parameters(), seldom.learner.parameters())
 
 
+@pytest.mark.slow
 def test_target_copies_are_counted_in_updates_of_all_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     part = training(
         update_every_steps=4, updates_per_round=3, update_tasks="all", target_update_every_updates=7, overlap=True
@@ -63,6 +66,7 @@ def test_target_copies_are_counted_in_updates_of_all_tasks(monkeypatch: pytest.M
     assert len(copied_at) > 30
 
 
+@pytest.mark.slow
 def test_target_copies_are_counted_in_steps_without_a_number_of_updates(monkeypatch: pytest.MonkeyPatch) -> None:
     part, copied_at = training(target_update_every_steps=50, updates_per_round=3), []
     monkeypatch.setattr(Learner, "copy_target", lambda self: copied_at.append(part.steps))

@@ -174,6 +174,7 @@ def test_a_truncated_episode_and_the_newest_step_end_a_sum_and_still_bootstrap()
     assert not batch.terminated.any()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     num_lanes=st.integers(1, 3),

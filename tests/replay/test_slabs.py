@@ -62,6 +62,7 @@ print(resident[-1] - resident[3])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="measures the heap of glibc")
 def test_blocks_do_not_break_the_areas_that_segments_leave() -> None:
     """Loading a replay grew the process by every segment's plain 7.2 MB, twelve times here."""

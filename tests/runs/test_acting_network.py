@@ -56,6 +56,7 @@ def stored(run: Path) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whose", ["online", "target"])
 def test_the_model_of_a_checkpoint_is_the_network_that_acts(whose: str, tmp_path: Path) -> None:
     networks: dict[str, dict[str, torch.Tensor]] = {}
@@ -90,6 +91,7 @@ def test_the_model_of_a_checkpoint_is_the_network_that_acts(whose: str, tmp_path
     assert all(torch.equal(model[key], value) for key, value in packed.network.state_dict().items())
 
 
+@pytest.mark.slow
 def test_the_best_weights_are_the_acting_network_s(tmp_path: Path) -> None:
     wanted = config("target")
     train(wanted, tmp_path / "run")
@@ -99,6 +101,7 @@ def test_the_best_weights_are_the_acting_network_s(tmp_path: Path) -> None:
     assert evaluate(tmp_path / "run", checkpoint="best", save=False).score("CartPole-v1").mean == scored
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stored_as", ["online", "target"])
 def test_such_a_run_continues_exactly(stored_as: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also from a checkpoint of a version in which the model was always the online network."""

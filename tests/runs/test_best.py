@@ -31,6 +31,7 @@ CARTPOLE: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_with_evaluations_the_best_weights_are_those_of_the_best_one(tmp_path: Path) -> None:
     """Also between checkpoints, and the last one counts."""
     config = from_dict({**CARTPOLE, "evaluation": {"episodes": 5, "epsilon": 0.0, "every_steps": 70}})
@@ -47,6 +48,7 @@ def test_with_evaluations_the_best_weights_are_those_of_the_best_one(tmp_path: P
     assert again.score("CartPole-v1").mean == max(scores.values())
 
 
+@pytest.mark.slow
 def test_without_evaluations_they_are_chosen_by_training_returns(tmp_path: Path) -> None:
     train(from_dict({**CARTPOLE, "evaluation": {"episodes": 1}}), tmp_path / "run")
     best = CheckpointStore(tmp_path / "run" / "checkpoints").best()
@@ -89,6 +91,7 @@ def test_the_score_of_an_evaluation_is_the_rise_above_random_play() -> None:
     assert rise_above_random(Evaluation(protocol, 1, rows, tuple(episodes))) == pytest.approx((120 - 20) / 10)
 
 
+@pytest.mark.slow
 def test_the_end_of_a_run_names_its_best_weights(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = from_dict({**CARTPOLE, "evaluation": {"episodes": 2, "every_steps": 100}})
     (tmp_path / "c.yaml").write_text(to_yaml(config))

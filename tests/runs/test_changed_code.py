@@ -149,6 +149,7 @@ def test_conditions_that_changed_before_a_resume_are_named_once(folder: Path) ->
     assert rows[0]["conditions"] == {"processor": "another", "torch_threads": 7, "versions.torch": "0.1"}
 
 
+@pytest.mark.slow
 def test_a_continued_run_has_the_threads_that_it_began_with(tmp_path: Path) -> None:
     data = {"tasks": {"suite": "gym", "names": ["CartPole-v1"]}, "network": {"hidden_units": 8}, "device": "cpu"}
     learning = {"batch_size": 8, "learning_starts_steps": 30, "replay_capacity_steps": 100}

@@ -48,6 +48,7 @@ def test_a_folder_without_a_run_is_refused_with_the_nearest_one_and_the_command_
     assert [path.name for path in Path("runs/cartpol").iterdir()] == ["run.lock"]
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_while_its_folder_was_made_is_begun_anew() -> None:
     """Killed before environment.json is written: at any of these moments nothing has been trained."""
     moments = [["checkpoints/"], ["checkpoints/", "evaluations/"], ["checkpoints/", "evaluations/", "config.yaml"]]

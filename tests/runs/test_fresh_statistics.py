@@ -60,6 +60,7 @@ def assert_equal(ours: dict[str, torch.Tensor], theirs: dict[str, torch.Tensor])
         assert torch.equal(ours[name], tensor), name
 
 
+@pytest.mark.slow
 def test_the_evaluated_network_is_the_stored_one_also_after_crashes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
