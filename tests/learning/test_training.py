@@ -343,14 +343,13 @@ def golden_run() -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_golden_run() -> None:
-    """On the processor that recorded it: bitwise. Elsewhere rounding differs: the first updates to rounding."""
-    golden = json.loads(GOLDEN.read_text())
+    """On a processor that recorded it: bitwise. Elsewhere sums round differently, and soon a spike is another one."""
     now = golden_run()
-    same_machine = golden["recorded_on"] == recorded_on()
-    if same_machine:
-        assert now == {key: golden[key] for key in ("losses", "spikes")}
-    assert now["losses"][:5] == pytest.approx(golden["losses"][:5], rel=1e-3)
-    assert np.mean(now["losses"][150:]) == pytest.approx(np.mean(golden["losses"][150:]), rel=0.2)
+    for golden in json.loads(GOLDEN.read_text()):
+        if golden["recorded_on"] == recorded_on():
+            assert now == {key: golden[key] for key in ("losses", "spikes")}
+        assert now["losses"][:3] == pytest.approx(golden["losses"][:3], rel=1e-5)
+        assert np.mean(now["losses"][150:]) == pytest.approx(np.mean(golden["losses"][150:]), rel=0.2)
 
 
 def recorded_on() -> dict[str, str]:
@@ -373,7 +372,7 @@ def test_measured_names_every_layer() -> None:
     assert set(measured[-1].layers) == {"linear1", "value", "advantage"}
 
 
-if __name__ == "__main__":  # python -m tests.learning.test_training records the golden run anew
+if __name__ == "__main__":  # python -m tests.learning.test_training records the golden run of this processor anew
     torch.set_num_threads(1)
-    GOLDEN.parent.mkdir(exist_ok=True)
-    GOLDEN.write_text(json.dumps({"recorded_on": recorded_on(), **golden_run()}, indent=1) + "\n")
+    others = [one for one in json.loads(GOLDEN.read_text()) if one["recorded_on"] != recorded_on()]
+    GOLDEN.write_text(json.dumps([*others, {"recorded_on": recorded_on(), **golden_run()}], indent=1) + "\n")
