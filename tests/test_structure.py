@@ -45,6 +45,7 @@ def test_docstrings_have_no_sphinx_roles(path: Path) -> None:
     assert not any(role in path.read_text() for role in roles), f"{path}: write ``name``, no Sphinx role"
 
 
+@pytest.mark.slow
 def test_a_method_that_a_subclass_must_define_says_so() -> None:
     """``raise NotImplementedError`` alone would be a traceback without a word."""
     raised = 0

@@ -168,6 +168,7 @@ def test_environments_of_other_people_are_played_in_the_calling_thread_only() ->
     assert threads == {threading.get_ident()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["GlobalRandom", "SampledActions"])
 def test_an_evaluation_repeats_itself_where_environments_draw_from_global_generators(name: str) -> None:
     suite = make_suite(TasksConfig(suite="gym", names=(f"tests.tasks.odd_envs:{name}-v0",)))

@@ -35,6 +35,7 @@ def call(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str
     return int(stop.value.code or 0), out.out, out.err
 
 
+@pytest.mark.slow
 def test_describe_gives_the_seven_counts(capsys) -> None:
     code, out, _ = call(capsys, "describe", "--json")
     assert code == 0
@@ -81,6 +82,7 @@ def test_describe_gives_spiking_methods_their_steps_where_the_configs_method_is_
             assert [methods[name][key] for key in keys] == [expected[name][key] for key in keys]
 
 
+@pytest.mark.slow
 def test_describe_says_which_config_and_takes_the_one_that_train_takes(capsys) -> None:
     _, out, _ = call(capsys, "describe")
     assert out.startswith("Methods under the config quickstart")
@@ -326,6 +328,7 @@ def test_best_weights_are_kept_and_can_be_evaluated(tmp_path: Path, capsys) -> N
     assert json.loads(out)["step"] == manifest["step"]
 
 
+@pytest.mark.slow
 def test_tensorboard_is_one_more_view(tmp_path: Path, capsys) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

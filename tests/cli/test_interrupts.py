@@ -29,12 +29,14 @@ except SystemExit as stop:
 TWICE = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["yaml", "tyro", "torch"])
 def test_ctrl_c_while_a_command_is_imported_is_one_line(moment: str) -> None:
     run = _ran(PROGRAM.format(moment=moment, then="run_program()"))
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "switchmt-snn: interrupted\n")
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_while_the_program_closes_ends_it_without_a_traceback() -> None:
     run = _ran(PROGRAM.format(moment="torch", then=f"{TWICE}; run_program()"))
     assert (run.returncode, run.stderr) == (-signal.SIGINT, "switchmt-snn: interrupted\n")

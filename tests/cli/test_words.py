@@ -122,6 +122,7 @@ def test_commands_in_messages_begin_as_the_program_was_called(tmp_path: Path, mo
     assert names.program() == "switchmt-snn"
 
 
+@pytest.mark.slow
 def test_a_printed_command_runs(tmp_path: Path) -> None:
     """Off the PATH, the remedy of an error is followed as it is printed."""
     environment = {**os.environ, "PATH": "/usr/bin:/bin"}
@@ -151,6 +152,7 @@ def test_streams_of_any_encoding_take_every_character(encoding: str, tmp_path: P
         assert text.splitlines()[-1] == "done u +- \\u8a9e \\udcff"
 
 
+@pytest.mark.slow
 def test_a_printed_config_is_the_same_in_any_encoding(tmp_path: Path) -> None:
     """Letters outside ASCII are escaped, not spelled out."""
     words = [sys.executable, "-m", "switchmt_snn", "train", "--name", "prüfung", "--print-config"]

@@ -54,6 +54,7 @@ def test_the_walk_meets_every_choice() -> None:
     assert {".device", "network.neuron", "network.encoding", "learning.loss", "switching.policy"} <= found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("section", "name", "names"), CHOICES, ids=IDS)
 def test_an_unknown_choice_is_refused_from_python_yaml_and_flag(section: str, name: str, names: tuple[str]) -> None:
     unknown = names[-1] + "X"

@@ -49,6 +49,7 @@ def test_a_host_without_torch_and_without_this_package_plays_pong(tmp_path: Path
     assert int(spikes.group(1)) > 0
 
 
+@pytest.mark.slow
 def test_the_host_sees_what_the_agent_saw_in_training() -> None:
     """Observations of the host's environment equal those of this package's tasks, so the scores mean the same."""
     from ale_py.vector_env import AtariVectorEnv

@@ -208,6 +208,7 @@ def test_a_missing_source_and_text_that_is_no_target(tmp_path: Path) -> None:
         TARGETS.load(str(tmp_path / "latin.yaml"))
 
 
+@pytest.mark.slow
 def test_a_target_of_ones_own(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     (tmp_path / "chip.yaml").write_text(make(name="my-chip"))
     out, _ = run_command(

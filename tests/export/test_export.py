@@ -49,6 +49,7 @@ def profile_of(variant: str) -> str | None:
     return "exact" if "subtract" in variant else "portable"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_exact_numbers_are_bitwise_equal(variant: str, seed: int) -> None:

@@ -69,6 +69,7 @@ def test_without_a_format_everything_that_fits_is_written(trained_run: Path, run
     ).stat().st_size
 
 
+@pytest.mark.slow
 def test_recorded_play_is_real_kept_and_checked(trained_run: Path, run_command: RunCommand) -> None:
     run_command("export", trained_run, "--onnx", "--parity-decisions", 50)
     first = trained_run / "recordings" / "breakout-step-600.npz"
@@ -85,6 +86,7 @@ def test_recorded_play_is_real_kept_and_checked(trained_run: Path, run_command: 
     assert "delete it" in err
 
 
+@pytest.mark.slow
 def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: RunCommand) -> None:
     for words, message in (
         ((tmp_path / "nowhere",), "no run folder"),
@@ -135,6 +137,7 @@ def test_a_failed_parity_exits_1_and_names_the_layer(
     assert json.loads((trained_run / "export" / "parity.json").read_text())["failures"]
 
 
+@pytest.mark.slow
 def test_the_same_from_python(trained_run: Path) -> None:
     """A run folder, an agent and a bare network."""
     from switchmt_snn import load_agent

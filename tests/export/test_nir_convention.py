@@ -124,6 +124,7 @@ STEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", STEPS)
 def test_a_step_that_does_not_fit_the_file_is_doubted_in_the_headline(case: str, tmp_path: Path) -> None:
     node, dt, doubt = STEPS[case]
@@ -138,6 +139,7 @@ def test_a_step_that_does_not_fit_the_file_is_doubted_in_the_headline(case: str,
         assert result.facts["headline"].startswith(seen)
 
 
+@pytest.mark.slow
 def test_a_file_of_ours_has_no_doubts_and_takes_no_other_convention(tmp_path: Path, run_command: RunCommand) -> None:
     agent = make_agent(neuron="LIF", beta=0.9999, timesteps=1)
     write_nir(nir_graph(fold_agent(agent), 0), tmp_path / "own.nir")

@@ -208,6 +208,7 @@ def test_counting_says_how_far_it_is(exported, tmp_path: Path) -> None:
     assert 0 < heard.said[1][1] < 40, "it is told between the chunks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("variant", "profile"), [("LIF", "legacy"), ("subtract", "legacy"), ("LIF", "spikingjelly")])
 def test_other_profiles_count_the_same(variant: str, profile: str, exported, tmp_path: Path) -> None:
     agent, x, path = exported(variant, profile)
@@ -230,6 +231,7 @@ def test_encoded_inputs_count_like_raw_observations(variant: str, exported, tmp_
         assert seen.effective_T == (raw.layers[0].effective_T[0], 0, *raw.layers[0].effective_T * 2)
 
 
+@pytest.mark.slow
 def test_a_missing_event_threshold_is_not_guessed(exported, tmp_path: Path) -> None:
     _, x, path = exported("events")
     stored = nir.read(path)

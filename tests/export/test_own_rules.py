@@ -90,6 +90,7 @@ def test_a_wrong_onnx_rule_of_an_encoding_is_one_line(rule: Any, wrong: Any, mes
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_right_onnx_rule_of_an_encoding_passes_the_bitwise_check(rule: Any) -> None:
     agent = rule(lambda graph, network, x: on_off(graph, x))
     played = {name: observations(agent, 8) for name in agent.suite.names}
@@ -187,6 +188,7 @@ def test_an_own_neuron_with_rules_is_exported_compared_and_counted(recipes: Path
     assert facts["tasks"][0]["layers"][0]["states"] == 1
 
 
+@pytest.mark.slow
 def test_an_own_neuron_with_dyadic_rules_is_compared_bitwise(recipes: Path) -> None:
     agent = make_agent(neuron="my_bitwise_neurons:BitwisePartialReset")
     result = check_parity(agent, {name: observations(agent, 8) for name in agent.suite.names}, dialect="exact")

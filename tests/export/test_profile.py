@@ -141,6 +141,7 @@ def test_profile_command(trained_run: Path, run_command: RunCommand) -> None:
     assert "decisions is 0, expected 1 to 10,000,000" in err
 
 
+@pytest.mark.slow
 def test_chips_and_targets_are_chosen_by_name(trained_run: Path, run_command: RunCommand) -> None:
     out, _ = run_command("profile", trained_run, "--decisions", 20, "--target", "speck")
     assert "speck" in out

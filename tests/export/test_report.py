@@ -107,6 +107,7 @@ def profiled(trained_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return profile(run, decisions=40).folder
 
 
+@pytest.mark.slow
 def test_every_number_is_in_profile_json(trained_run: Path, run_command: RunCommand) -> None:
     out, _ = run_command("profile", trained_run, "--decisions", 40)
     folder = trained_run / "profile"
@@ -186,6 +187,7 @@ def words_of(facts: dict[str, Any]) -> str:
     return " ".join(line for line in page.text if not re.search(r"pJ|Source:|Memory after|Neuron updates cost", line))
 
 
+@pytest.mark.slow
 def test_the_report_of_an_ann_speaks_of_no_spikes(ann_and_spiking: list[dict[str, Any]]) -> None:
     ann, spiking = map(words_of, ann_and_spiking)
     for word in ("spike", "Spikes", "fired", "Firing", "simulation step", "1 bits", "break-even", "quantised"):

@@ -73,6 +73,7 @@ def test_steps_follow_the_shares_whatever_the_lengths_of_episodes() -> None:
     assert played.shares() == pytest.approx(list(weights / weights.sum()), abs=0.01)
 
 
+@pytest.mark.slow
 def test_uniform_share_is_a_floor() -> None:
     policy = deficit_policy(uniform_share=0.3, deficit_temperature=0.01)
     played = Played(policy, [10, 10, 10], [lambda _: 0.0, lambda _: 10.0, lambda _: 10.0]).run(3_000)

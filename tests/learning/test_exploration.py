@@ -56,6 +56,7 @@ def test_durations_follow_the_zeta_distribution() -> None:
     assert abs((durations == 20).mean() - weights[19:].sum() / weights.sum()) < 0.01
 
 
+@pytest.mark.slow
 def test_epsilon_is_the_probability_of_beginning() -> None:
     explores, actions = chosen(100, 0.05, 20_000)
     begins = explores & ~np.roll(explores, 1, axis=0)

@@ -61,6 +61,7 @@ def play(policy: SwitchingPolicy, lengths: list[int], drift: float, values: list
     return log
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(
     policy=st.sampled_from(sorted(CRITERIA)),

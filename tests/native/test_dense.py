@@ -37,6 +37,7 @@ def close(ours: Tensor, exact: Tensor, rounded: bool, terms: int = 1, partial_su
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 @settings(max_examples=60, deadline=None)
 @given(

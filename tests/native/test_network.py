@@ -53,6 +53,7 @@ def test_parameters_are_read_again_after_the_target_is_copied() -> None:
         assert torch.equal(ours[1], theirs[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout", READOUTS)
 def test_memory_of_a_decision_is_freed_without_the_garbage_collector(readout: str) -> None:
     """Its memory is free at once, not when Python looks for cycles."""

@@ -32,6 +32,7 @@ def plain_gated(config: NetworkConfig, y_SRC: Tensor, gain_C: Tensor) -> Tensor:
     return spikes
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     form=st.fixed_dictionaries(FORMS),

@@ -27,6 +27,7 @@ def close(ours: Tensor, exact: Tensor, low: bool) -> None:
     torch.testing.assert_close(ours.double(), exact, rtol=5e-3 if low else 1e-5, atol=scale * (4e-3 if low else 2e-6))
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(
     lanes=st.integers(1, 300),
@@ -52,6 +53,7 @@ def test_linear_products_and_their_gradients(lanes, channels, places, outputs, l
     close(grad_bias, grad_y.double().sum(0), False)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     batch=st.integers(1, 9),

@@ -124,6 +124,7 @@ def compare(replay: FrameReplay, lanes: list[NaiveLane]) -> None:
     assert len(replay) == sum(len(lane.held()) for lane in lanes)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     num_lanes=st.integers(1, 3),
@@ -240,6 +241,7 @@ def test_stored_and_loaded_is_the_same(slots: int, form: str) -> None:
     assert copy.nbytes == replay.nbytes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.uint8, np.bool_, np.float32])
 @pytest.mark.parametrize("shape", [(1, 84, 84), (6, 10, 10), (4,)])
 @pytest.mark.parametrize("form", ["compressed", "device"])

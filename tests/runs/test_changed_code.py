@@ -94,6 +94,7 @@ def test_the_modules_of_a_runs_plugins_are_hashed(folder: Path) -> None:
     assert set(facts["files_sha256"]) == set(MODULES)
 
 
+@pytest.mark.slow
 def test_a_module_that_changed_before_a_resume_is_named_once(folder: Path) -> None:
     assert continued(folder, 70) == []
     assert not (folder / "run" / "code_changes.jsonl").exists()

@@ -22,6 +22,7 @@ TASKS = st.one_of(
 LISTS = st.lists(TASKS, min_size=1, max_size=12, unique=True).map(tuple)
 
 
+@pytest.mark.slow
 @given(LISTS, LISTS)
 def test_other_tasks_have_another_file_name(one: tuple[str, ...], two: tuple[str, ...]) -> None:
     assert (file_name(*one) == file_name(*two)) == (one == two)

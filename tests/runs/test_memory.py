@@ -145,6 +145,7 @@ def test_the_estimate_is_near_what_a_run_takes(
     assert 0.75 < float(done.stdout) < 1.25
 
 
+@pytest.mark.slow
 def test_the_peak_is_of_this_program_and_not_of_the_one_that_started_it() -> None:
     held = np.ones(GIB // 8)  # a gibibyte
     program = "from switchmt_snn.machine.memory import peak_bytes; print(peak_bytes())"

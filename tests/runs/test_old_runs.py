@@ -38,6 +38,7 @@ FREE = ("trunk.conv1.synapses.bias", "trunk.conv1.normalization.running_mean_KC"
 up to 8.5e-5 on a processor without AVX-512), and the running mean follows."""
 
 
+@pytest.mark.slow
 def test_an_old_run_continues_as_the_old_version_continued_it(old_run: Path) -> None:
     """Same episodes, and the same weights to rounding (another processor may sum in another order)."""
     steps = CONTINUED_TO[old_run.name]
@@ -59,6 +60,7 @@ def test_an_old_run_continues_as_the_old_version_continued_it(old_run: Path) -> 
     assert len({line.count(",") for line in after.splitlines()}) == 1  # a table still
 
 
+@pytest.mark.slow
 def test_an_old_run_evaluates_to_its_old_scores(old_run: Path) -> None:
     (stored,) = (old_run / "evaluations").glob("*.json")
     old_scores = {row["task"]: row["mean"] for row in json.loads(stored.read_text())["tasks"]}
@@ -86,6 +88,7 @@ def test_old_onnx_files_decide_as_the_old_run_does(old_run: Path) -> None:
             np.testing.assert_allclose(q_values, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_old_run_is_exported_and_profiled_again(old_run: Path, tmp_path: Path) -> None:
     result = export(old_run, ExportSettings(parity_decisions=20), "last", tmp_path / "again", lambda text: None)
     assert result.parity["failures"] == []
@@ -93,6 +96,7 @@ def test_an_old_run_is_exported_and_profiled_again(old_run: Path, tmp_path: Path
     assert {task["task"] for task in facts["tasks"]} == set(load_agent(old_run).suite.names)
 
 
+@pytest.mark.slow
 def test_every_config_of_the_stored_results_still_loads() -> None:
     paths = sorted((FIXTURES.parents[2] / "results").rglob("config.yaml"))
     assert len(paths) > 20

@@ -33,6 +33,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_packed_run_plays_exports_and_profiles_as_the_run_does(finished: Path, tmp_path: Path) -> None:
     packed = pack(finished, tmp_path / "sent" / "mine")
     for name in ("config.yaml", "environment.json", "episodes.csv", "switches.csv", "metrics.jsonl"):
@@ -92,6 +93,7 @@ def own(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     return tmp_path / "package" / "small"
 
 
+@pytest.mark.slow
 def test_a_pretrained_run_is_read_where_it_is_and_copied_to_be_written(own: Path) -> None:
     before = bytes_of(own)
     assert load_agent("pretrained/small").step == 400
@@ -108,6 +110,7 @@ def test_a_pretrained_run_is_read_where_it_is_and_copied_to_be_written(own: Path
     assert open_run("pretrained/small", to_write=True).path == copied  # the copy with its results, not a fresh one
 
 
+@pytest.mark.slow
 def test_what_was_exported_of_a_pretrained_run_is_read_under_its_name(own: Path) -> None:
     export("pretrained/small", ExportSettings(onnx=True, parity_decisions=8))
     assert load_exported("pretrained/small").step == 400
@@ -115,6 +118,7 @@ def test_what_was_exported_of_a_pretrained_run_is_read_under_its_name(own: Path)
     assert not (own / "export").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pretrained/small", "the package's folder"])
 def test_training_in_a_pretrained_run_is_refused_and_its_remedy_works(own: Path, name: str) -> None:
     run = name if name == "pretrained/small" else str(own)

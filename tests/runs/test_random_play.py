@@ -62,6 +62,7 @@ def randomly(played: list[tuple[str, int]]) -> set[int]:
     return tasks
 
 
+@pytest.mark.slow
 def test_a_later_evaluation_has_the_same_scores_without_playing(run: Path, played: list[tuple[str, int]]) -> None:
     read = evaluate(run)
     assert randomly(played) == set(), "training's final evaluation kept them"
@@ -77,6 +78,7 @@ def test_a_later_evaluation_has_the_same_scores_without_playing(run: Path, playe
     assert randomly(played) == set(), "random play has no epsilon"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [{"episodes": 2}, {"seed": 3}, {"num_envs": 1}, {"max_episode_steps": 50}])
 def test_another_protocol_is_played(run: Path, played: list[tuple[str, int]], changed: dict[str, int]) -> None:
     evaluate(run, **changed)
@@ -85,6 +87,7 @@ def test_another_protocol_is_played(run: Path, played: list[tuple[str, int]], ch
     assert randomly(played) == set()
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_played_again(run: Path, played: list[tuple[str, int]]) -> None:
     (path,) = (run / "random_play").glob("CartPole-v1_*.json")
     whole = path.read_text()

@@ -37,6 +37,7 @@ def evaluations(run: Path) -> dict[int, list[int]]:
     return seeds
 
 
+@pytest.mark.slow
 def test_training_ends_at_the_first_evaluation_that_reaches_every_goal(tmp_path: Path) -> None:
     """The final scores are of other episodes than those that ended it, and the run is finished."""
     config = cartpole_and_car([5.0, -200.0])  # any policy has these
@@ -49,12 +50,14 @@ def test_training_ends_at_the_first_evaluation_that_reaches_every_goal(tmp_path:
     assert (again.status, again.step) == ("already_finished", 100)
 
 
+@pytest.mark.slow
 def test_training_goes_on_while_one_goal_is_missed(tmp_path: Path) -> None:
     result = train(cartpole_and_car([5.0, -1.0]), tmp_path / "run")  # a mountain car needs 110 steps at least
     assert (result.status, result.step) == ("finished", 300)
     assert evaluations(tmp_path / "run") == {100: [10_000], 200: [10_000], 300: [10_000]}
 
 
+@pytest.mark.slow
 def test_a_solved_run_that_was_cut_off_before_its_last_evaluation_makes_it(tmp_path: Path) -> None:
     config = cartpole_and_car([5.0, -200.0])
     first = train(config, tmp_path / "run")

@@ -15,6 +15,7 @@ from switchmt_snn.runs import run as runs
 from tests.runs.test_stop_at_returns import cartpole_and_car, evaluations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("goals", [[], [5.0, -200.0]])
 def test_an_evaluation_that_was_stopped_is_played_when_the_run_goes_on(
     goals: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -23,6 +23,7 @@ evaluation: {episodes: 1}
 """
 
 
+@pytest.mark.slow
 def test_a_runs_config_trains_another_method_and_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "study.yaml").write_text(QUICK)
     original = load_config(tmp_path / "study.yaml")
@@ -38,6 +39,7 @@ def test_a_runs_config_trains_another_method_and_back(tmp_path: Path, capsys: py
     assert three == one
 
 
+@pytest.mark.slow
 def test_a_continued_run_keeps_its_record_and_a_changed_one_is_refused_by_what_was_changed(tmp_path: Path) -> None:
     (tmp_path / "study.yaml").write_text(QUICK)
     train(tmp_path / "study.yaml", tmp_path / "run")
@@ -48,6 +50,7 @@ def test_a_continued_run_keeps_its_record_and_a_changed_one_is_refused_by_what_w
     assert load_config(stored).total_steps == load_config(stored, reopen=False).total_steps == 120
 
 
+@pytest.mark.slow
 def test_a_flag_that_a_run_cannot_take_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "study.yaml").write_text(QUICK)
     train(tmp_path / "study.yaml", tmp_path / "run")

@@ -108,6 +108,7 @@ def test_alif_without_adaptation_is_lif(beta: float, reset: str, seed: int, T: i
     assert torch.equal(state[0], membrane)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     form=st.sampled_from(FORMS),
@@ -174,6 +175,7 @@ def test_synaptic_is_bitwise_snntorchs(reset: str, alpha: float, beta: float, th
     assert torch.equal(state[1], membrane)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reset", RESETS)
 @pytest.mark.parametrize("neuron", NEURONS)
 def test_traced_code_equals_the_step(neuron: str, reset: str) -> None:

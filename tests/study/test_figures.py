@@ -98,6 +98,7 @@ def test_without_curves_references_or_switches_a_figure_is_left_out(
     assert all(series.low == () for series in chart.series)
 
 
+@pytest.mark.slow
 def test_every_figure_is_on_the_page_and_in_three_files(
     evaluated: tuple[Study, StudyFolder, list[TrialResult]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

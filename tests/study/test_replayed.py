@@ -138,6 +138,7 @@ def test_a_runs_own_policy_says_what_it_said(policy: str, changes: dict[str, Any
     assert {row.compared for row in said.values()} <= {"open"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "learning",
     [
@@ -162,6 +163,7 @@ def replayed_minatar(*overrides: str, policies: tuple[str, ...] = ()) -> Replay:
     return replay_policies(RunFolder(RESULTS / "switchmt-seed1"), policies, overrides)
 
 
+@pytest.mark.slow
 def test_a_stored_run_of_minatar_says_what_it_said() -> None:
     """915 visits of 600,000 steps, written by an older version."""
     replayed = replayed_minatar(policies=("parameter_change",))
@@ -184,6 +186,7 @@ def by_hand(leaves: Callable[[dict[str, str]], bool]) -> dict[int, int]:
     return first
 
 
+@pytest.mark.slow
 def test_other_thresholds_and_policies_are_those_of_the_file() -> None:
     free = ("switching.min_stay_steps=0", "switching.max_stay_steps=null")
     fixed = replayed_minatar(*free, "switching.visit_episodes=31", policies=("fixed_episodes",))
@@ -202,6 +205,7 @@ def test_other_thresholds_and_policies_are_those_of_the_file() -> None:
     assert facts["median_steps"] == ordered[(len(ordered) - 1) // 2] or ordered[(len(ordered) - 1) // 2] == 10**9
 
 
+@pytest.mark.slow
 def test_a_visit_may_be_left_earlier_at_the_same_step_later_or_stay_open(tmp_path: Path) -> None:
     run, decided, _ = trained(tmp_path / "run", config_of("fixed_episodes", {"visit_episodes": 6}))
     whole = [one.visit for one in decided if isinstance(one.decision, SwitchTo)]
@@ -213,6 +217,7 @@ def test_a_visit_may_be_left_earlier_at_the_same_step_later_or_stay_open(tmp_pat
         assert {row.episodes_at for row in rows if row.visit in whole} == ({count} if count < 12 else {None})
 
 
+@pytest.mark.slow
 def test_what_the_logs_cannot_answer_is_refused_by_name(tmp_path: Path) -> None:
     run, _, _ = trained(tmp_path / "run", config_of("fixed_episodes", {}))
     replayed = replay_policies(RunFolder(run))
@@ -238,6 +243,7 @@ def test_what_the_logs_cannot_answer_is_refused_by_name(tmp_path: Path) -> None:
         replay_policies(RunFolder(trained(tmp_path / "single", single)[0]))
 
 
+@pytest.mark.slow
 def test_eq_3_per_update_is_replayed_from_eq_3(tmp_path: Path) -> None:
     run, _, _ = trained(
         tmp_path / "run", config_of("parameter_change", {"change_threshold": 1e-4, "max_stay_steps": 90})
@@ -254,6 +260,7 @@ def test_eq_3_per_update_is_replayed_from_eq_3(tmp_path: Path) -> None:
         assert row.numbers["change_per_update"] < row.numbers["largest_change_per_update"] * 0.9
 
 
+@pytest.mark.slow
 def test_logs_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     run, _, _ = trained(tmp_path / "run", config_of("fixed_episodes", {}))
     lines = (run / "episodes.csv").read_text().splitlines(keepends=True)
@@ -262,6 +269,7 @@ def test_logs_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
         replay_policies(RunFolder(run))
 
 
+@pytest.mark.slow
 def test_a_visit_that_goes_on_after_the_switch_is_seen_but_not_left_again(tmp_path: Path) -> None:
     """The next task is chosen once per visit, as the contract of ``Criterion.next_task`` says."""
     run, _, _ = trained(tmp_path / "run", config_of("fixed_episodes", {"visit_episodes": 12}))
@@ -281,6 +289,7 @@ def test_a_visit_that_goes_on_after_the_switch_is_seen_but_not_left_again(tmp_pa
     assert len(counted) == sum(row.compared != "open" for row in rows)
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_table_json_and_a_csv(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -310,6 +319,7 @@ def test_the_command_prints_a_table_json_and_a_csv(
         assert said in " ".join((printed.out + printed.err).split())
 
 
+@pytest.mark.slow
 def test_a_run_from_before_judge_learning_is_asked_as_it_was(tmp_path: Path) -> None:
     config = config_of("parameter_change", {"judge_learning": "always"})
     run, decided, _ = trained(tmp_path / "run", config)

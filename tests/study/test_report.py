@@ -129,6 +129,7 @@ def test_shares_and_comparisons_are_those_of_the_statistics(finished: tuple[Stud
     assert shown["switchmt"]["p"] is None
 
 
+@pytest.mark.slow
 def test_tables_and_page_say_what_is_missing_and_the_same_numbers(finished: tuple[Study, StudyFolder]) -> None:
     study, folder = finished
     text = (folder.path / "tables.md").read_text()

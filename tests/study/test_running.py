@@ -244,6 +244,7 @@ def test_more_jobs_than_cores_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_p
         local.jobs_for(two, 0)
 
 
+@pytest.mark.slow
 def test_a_folder_takes_more_trials_but_no_other_ones(tmp_path: Path) -> None:
     path, folder = tmp_path / "s.yaml", StudyFolder(tmp_path / "study")
     folder.prepare(load_study(tiny(path, "seeds: 2\n")))

@@ -36,6 +36,7 @@ GAMES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("suite", "names", "tasks", "longest"), GAMES)
 def test_an_own_loop_plays_the_episodes_of_an_evaluation(
     suite: str, names: tuple[str, ...], tasks: dict[str, object], longest: int

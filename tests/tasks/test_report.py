@@ -28,6 +28,7 @@ def report_of(name: str, **settings: Any) -> EnvironmentReport:
     return report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suite", SUITES)
 def test_every_suites_examples_repeat_themselves_in_any_thread(suite: str) -> None:
     reports = check_env(*SUITES[suite].examples, suite=suite, steps=60)
@@ -92,6 +93,7 @@ class SleepsInStep(gymnasium.Env[Any, Any]):
 gymnasium.register("SleepsInStep-v0", SleepsInStep)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_slow_environment_is_played_for_its_time_and_the_result_says_so() -> None:
     said: list[str] = []
@@ -125,6 +127,7 @@ def test_the_command_says_that_the_limit_ended_the_play(capsys: pytest.CaptureFi
     assert err.splitlines()[0] == f"{MODULE}:Plain-v0: random play of 1,000 steps, for 5e-10 s at the most"
 
 
+@pytest.mark.slow
 def test_drawing_from_global_generators_is_seen_and_does_not_keep_play_from_repeating() -> None:
     report = report_of("GlobalRandom")
     assert report.draws_globally
@@ -132,6 +135,7 @@ def test_drawing_from_global_generators_is_seen_and_does_not_keep_play_from_repe
     assert not report_of("Plain").draws_globally
 
 
+@pytest.mark.slow
 def test_warnings_of_gymnasiums_checker_are_notes() -> None:
     notes = report_of("DoubleObservation").notes
     assert any("was expecting a numpy array" in note and "\x1b" not in note for note in notes)

@@ -56,6 +56,7 @@ def test_atari_equals_gymnasium_with_the_standard_wrappers(game: str, name: str)
     single.close()
 
 
+@pytest.mark.slow
 def test_stacks_equal_the_vector_environments_own() -> None:
     """With no-ops, FIRE and sticky actions: our stacking of single frames equals AtariVectorEnv's stacking."""
     config = TasksConfig(names=("breakout",), sticky_action_probability=0.25, num_envs=2)

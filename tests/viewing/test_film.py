@@ -92,6 +92,7 @@ def drawn_spikes(frame: Path, axis: TimeAxis, raster: Any, rows: int, decisions:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["direct", "rate"])
 @pytest.mark.parametrize("tasks", [("asterix",), ("breakout", "asterix")])
 def test_the_spikes_that_are_drawn_are_those_of_activity(tasks: tuple[str, ...], encoding: str, tmp_path: Path) -> None:
@@ -131,6 +132,7 @@ def test_the_spikes_that_are_drawn_are_those_of_activity(tasks: tuple[str, ...],
     assert fired > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("epsilon", [0.0, 0.3])
 def test_episodes_are_those_of_an_evaluation(epsilon: float, tmp_path: Path) -> None:
     agent = watched(CARTPOLE)
@@ -161,6 +163,7 @@ def test_value_and_advantage_add_up_to_q() -> None:
     assert abs(insight.value) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{"method": "DQN"}, {"readout": "max_membrane"}])
 def test_networks_without_one_value_have_none(changes: dict[str, str], tmp_path: Path) -> None:
     agent = watched(CARTPOLE, **changes)
@@ -176,6 +179,7 @@ def decoded(path: Path, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, size[1], size[0], 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".mp4", ".gif"])
 def test_a_video_has_every_frame_in_order(ending: str, tmp_path: Path) -> None:
     """Each decoded frame is nearer to its own PNG frame than to every other one."""
@@ -325,6 +329,7 @@ def exported(agent: Watched, runtime: str) -> Watched:
     return Watched(agent.agent, lambda own: tracer_of_onnx(own, network, onnx_agent, step), runtime)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnx", "nir"])
 @pytest.mark.parametrize("encoding", ["direct", "rate"])
 def test_exported_files_play_and_fire_like_the_network(runtime: str, encoding: str, tmp_path: Path) -> None:
@@ -359,6 +364,7 @@ def test_without_a_screen_a_window_is_refused_in_one_line(
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_window_shows_every_frame_until_it_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SDL's dummy driver is a screen without anybody who looks."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -385,6 +391,7 @@ def test_a_window_shows_every_frame_until_it_is_closed(tmp_path: Path, monkeypat
     assert (only_shown.path, only_shown.frames) == (None, 3)
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_film_so_far(tmp_path: Path) -> None:
     agent = watched(CARTPOLE)
 

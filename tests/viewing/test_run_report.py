@@ -132,6 +132,7 @@ def leaves(value: Any) -> list[Any]:
     return [value]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [[LAGGING], [RESULTS / "cartpole" / "cartpole-s1"], [*SEEDS[:2], DQN]], ids=len)
 def test_every_number_of_the_page_is_in_the_json_beside_it(runs: list[Path], tmp_path: Path) -> None:
     from switchmt_snn.drawing.numbers import duration
@@ -173,6 +174,7 @@ def test_figures_are_files_in_three_formats_with_their_data(lagging: Path) -> No
     assert rows == [(x, y) for x, y in zip(loss["x"], loss["y"], strict=True) if y is not None]
 
 
+@pytest.mark.slow
 def test_runs_that_differ_in_their_seed_are_a_group_with_a_band(tmp_path: Path) -> None:
     _, facts = written(write_report([*SEEDS, DQN], tmp_path))
     assert [len(group["runs"]) for group in facts["groups"]] == [3, 1]

@@ -146,6 +146,7 @@ def changed(config: ExperimentConfig, remedy: Remedy) -> ExperimentConfig:
     return resolve(replace(config, **changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["SwitchMT", "DSQN_D", "DQN_D", "DQN"])
 @pytest.mark.parametrize(
     "network", [{}, {"stream_normalization": "batch"}, {"mlp_normalization": "batch"}, {"k_winners": 16}]
@@ -186,6 +187,7 @@ VARIANTS: tuple[dict[str, dict[str, Any]], ...] = (
 OF_SPIKES = {f"network.{name}" for name in ("threshold", "timesteps", "beta", "k_winners", "stream_current_thresholds")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", presets())
 @pytest.mark.parametrize("method", METHODS)
 def test_no_warning_of_any_run_names_what_it_cannot_do_or_has_done(preset: str, method: Any) -> None:
