@@ -51,7 +51,7 @@ one in the first 50,632 stored transitions. Holding the accelerator would, and `
 """,
     "three-held-s1": """\
 three-half-s1 with `learning.longest_random_action_steps: 100` (random actions that last), otherwise the same settings
-and seed; it goes on, so far to 160,160 of 1,000,000 steps. The evaluation is that of 100,000 steps.
+and seed; stopped after 160,160 of 1,000,000 steps, because its machine was lost. The evaluation is that of 100,000 steps.
 **Enduro is being learned**: 3.5 ± 1.0 after 38,900 steps of its own, where three-half-s1 has 0 of 30 episodes with a
 car passed, and episodes of 2 to 36 in training at 131,000 steps. Pong is where it was in three-half-s1 (-19.0 against
 -20.2), Breakout below (3.0 ± 0.3 against 6.8 ± 1.0, after 21,700 steps of its own). One seed each: no word on whether
