@@ -153,6 +153,7 @@ def test_agent_acts_on_one_observation_and_on_batches() -> None:
         agent.act(batch[0, 0], "asterix")
 
 
+@pytest.mark.slow
 def test_environments_of_other_people_are_played_in_the_calling_thread_only() -> None:
     """Their state may be shared between copies: the same protocol gives the same scores."""
     threads: set[int] = set()
@@ -178,6 +179,7 @@ def test_an_evaluation_repeats_itself_where_environments_draw_from_global_genera
     assert len({episode.score for episode in one.episodes if episode.policy == "random"}) == 7
 
 
+@pytest.mark.slow
 def test_an_episode_that_does_not_end_is_cut_off_and_announced() -> None:
     suite = make_suite(TasksConfig(suite="gym", names=("tests.tasks.odd_envs:Endless-v0",)))
     notes: list[str] = []

@@ -110,6 +110,7 @@ def test_describe_names_trained_and_deployed_parameters(capsys) -> None:
     assert "are trained" not in out
 
 
+@pytest.mark.slow
 def test_describe_table_names_every_method(capsys) -> None:
     _, out, _ = call(capsys, "describe", "minatar")
     for method in METHODS:
@@ -193,6 +194,7 @@ def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypat
     assert "did you mean 'pong'" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -247,6 +249,7 @@ def test_wrong_use_is_one_line_and_exit_2(words: list[str], message: str, capsys
     assert list(tmp_path.iterdir()) == [], "a refused command leaves nothing behind"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_device_that_is_not_there(capsys, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -255,6 +258,7 @@ def test_a_device_that_is_not_there(capsys, tmp_path, monkeypatch) -> None:
     assert "device is 'cuda', expected one that this machine has" in err
 
 
+@pytest.mark.slow
 def test_print_config_is_the_resolved_config(capsys) -> None:
     code, out, _ = call(capsys, "train", "paper", "--print-config", "--seed", "5")
     assert code == 0
@@ -264,11 +268,13 @@ def test_print_config_is_the_resolved_config(capsys) -> None:
     assert data["network"]["trunk"] == "nature"
 
 
+@pytest.mark.slow
 def test_command_line_surface_is_frozen() -> None:
     """Every option of every command with its values: an added, removed or changed one fails."""
     assert surface().splitlines() == SURFACE.read_text().splitlines(), "meant so? python -m tests.cli.surface"
 
 
+@pytest.mark.slow
 def test_every_setting_of_the_config_is_an_option_of_train_and_describe() -> None:
     for command in ("train", "describe"):
         flags = {flag for option in options(command) for flag in option.split() if flag.startswith("--")}

@@ -71,6 +71,7 @@ def test_two_runs_where_one_is_expected_are_one_line(capsys: pytest.CaptureFixtu
     assert (code, err) == (2, "switchmt-snn: evaluate got a b, expected one RUN; see switchmt-snn evaluate --help\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["1e6", "1000000", "1_000_000", "1.0e6"])
 def test_a_number_of_steps_as_people_write_it(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = call(capsys, "train", "--total-steps", text, "--tasks.frame-stack", "2", "--print-config")
@@ -87,6 +88,7 @@ def test_what_is_no_whole_number_is_refused(text: str) -> None:
         from_dict({"total_steps": text})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "describe"])
 def test_help_names_config_and_the_presets(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = call(capsys, command, "--help")

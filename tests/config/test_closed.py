@@ -141,6 +141,7 @@ def test_python_and_yaml_store_the_same_types() -> None:
         replace(ExperimentConfig(), network="small")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["my_module:MyClass", "package.module:Name"])
 def test_names_of_classes_are_accepted_where_a_field_says_so(name: str) -> None:
     for section, field, kind in FIELDS:
@@ -153,6 +154,7 @@ def test_names_of_classes_are_accepted_where_a_field_says_so(name: str) -> None:
                 in_python(section, field, name)
 
 
+@pytest.mark.slow
 def test_every_field_is_checked() -> None:
     """A value that no field can hold is refused by all of them."""
     refused = set()

@@ -123,6 +123,7 @@ def test_differences_name_the_field() -> None:
     assert differences(old, new) == {"learning.discount": (0.9, 0.99)}
 
 
+@pytest.mark.slow
 def test_every_field_is_documented() -> None:
     sections = list(field_documentation())
     assert len(sections) > 5

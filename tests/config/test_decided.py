@@ -27,6 +27,7 @@ def written(tmp_path: Path, asked: ExperimentConfig) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("preset", VARIED)
 def test_a_stored_config_varies_as_the_one_it_was_made_from(preset: str, method: str, tmp_path: Path) -> None:
@@ -59,6 +60,7 @@ def test_a_value_that_was_set_or_edited_stays(tmp_path: Path) -> None:
     assert (varied.network.dendrites, varied.switching.policy) == ("shared", "parameter_change")
 
 
+@pytest.mark.slow
 def test_the_config_of_an_older_run_can_be_varied(tmp_path: Path) -> None:
     """It has no record: values that the rules give as well are taken as left open."""
     for method, other in (("SwitchMT", "DQN"), ("DQN", "SwitchMT")):

@@ -11,6 +11,7 @@ from switchmt_snn.config.plugins import load_plugin, plugin_name
 from switchmt_snn.errors import ConfigError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "words"),
     [
@@ -42,6 +43,7 @@ def test_a_module_that_fails_is_one_line_and_exit_code_2(
     assert f"{flag.removeprefix('--')} is '{name}:Mine'" in error
 
 
+@pytest.mark.slow
 def test_a_gymnasium_id_of_a_module_that_fails_is_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
     (tmp_path / "failing_environments.py").write_text("missing_name")
     monkeypatch.syspath_prepend(tmp_path)

@@ -21,6 +21,7 @@ def commands() -> list[str]:
     return [command for page in sorted(RESULTS.glob("*/README.md")) for command in COMMAND.findall(page.read_text())]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", commands())
 def test_a_printed_command_asks_for_every_setting_that_the_run_had(
     command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -58,6 +58,7 @@ def test_comments_shorten_commands_and_numbers() -> None:
     assert shortened("f(1, 20_000)") == "f(1, 20_000)"
 
 
+@pytest.mark.slow
 def test_a_block_that_fails_is_reported_with_its_line(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match=r"page.md:7(.|\n)*unknown"):
         Reader(tmp_path).follow(Block("page.md", 7, "bash", "switchmt-snn train unknown-preset\n"))

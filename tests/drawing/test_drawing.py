@@ -25,6 +25,7 @@ def chart(*series: Series, **more: object) -> Chart:
     return Chart("c", "A <title> & more", "steps", series, **more)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @given(NUMBERS, st.floats(1e-9, 1e9), st.integers(1, 12))
 def test_ticks_lie_in_the_range_and_are_evenly_spaced(low: float, width: float, wanted: int) -> None:
     high = low + width
@@ -38,6 +39,7 @@ def test_ticks_lie_in_the_range_and_are_evenly_spaced(low: float, width: float, 
         np.testing.assert_allclose(np.diff(found), found[1] - found[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(NUMBERS, st.one_of(st.none(), NUMBERS, st.just(float("nan")))), min_size=0, max_size=30))
 def test_nothing_is_drawn_outside_of_the_picture(points: list[tuple[float, float | None]]) -> None:
     points = sorted(points, key=lambda point: point[0])
@@ -89,6 +91,7 @@ def test_svg_is_xml_that_escapes_names_and_needs_no_network() -> None:
     assert "var(--" not in standalone_svg(picture_of(figures[0], alone=True))
 
 
+@pytest.mark.slow
 def test_png_shows_the_same_as_svg() -> None:
     """The colour of the line is there, at its height: a low value is drawn low."""
     for value, half in ((0.0, "lower"), (1.0, "upper")):

@@ -112,6 +112,7 @@ def counted(synapses: CountedSynapses, spikes: torch.Tensor) -> int:
     return int(counter.operations_T.sum())
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(**LAYERS)
 def test_counts_equal_a_pass_with_ones(
@@ -129,6 +130,7 @@ def test_counts_equal_a_pass_with_ones(
         assert synapses.dense_operations() == int(layer(ones).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not importlib.util.find_spec("neurobench"), reason="neurobench is not installed")
 @pytest.mark.filterwarnings("ignore")
 @settings(max_examples=60, deadline=None)
@@ -144,6 +146,7 @@ def test_counts_equal_neurobench(linear, channels, out, side, kernel, stride, pa
     assert 3 * synapses.dense_operations() == dense
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not importlib.util.find_spec("spikingjelly"), reason="spikingjelly is not installed")
 @pytest.mark.filterwarnings("ignore")
 @settings(max_examples=40, deadline=None)

@@ -146,6 +146,7 @@ def with_wrong_layer(network: FoldedNetwork, index: int) -> FoldedNetwork:
     return network.with_synapses(lambda node: replace(node, shift_KO=node.shift_KO + 1.0) if node is wrong else node)
 
 
+@pytest.mark.slow
 def test_a_broken_export_is_caught_and_the_layer_named() -> None:
     """Parity must fail when one number of one layer is wrong."""
     agent = dyadic_copy(make_agent())
@@ -200,6 +201,7 @@ def test_files_say_what_a_host_must_know() -> None:
     assert not [t for t in model.graph.initializer if t.data_location == onnx.TensorProto.EXTERNAL]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", ["portable", "spikingjelly", "legacy"])
 @pytest.mark.parametrize("variant", ["SwitchMT", "LIF", "mlp"])
 def test_nir_files_survive_the_disk(profile: str, variant: str, tmp_path: Path) -> None:
@@ -242,6 +244,7 @@ def test_legacy_with_subtract_needs_the_rule_from_the_metadata() -> None:
     )
 
 
+@pytest.mark.slow
 def test_what_nir_cannot_say_is_refused() -> None:
     cases = {
         "DQN": "ReLU",
@@ -266,6 +269,7 @@ def test_weights_that_are_not_finite_are_refused() -> None:
         fold_agent(agent)
 
 
+@pytest.mark.slow
 def test_damaged_and_foreign_files_are_named(tmp_path: Path) -> None:
     agent = make_agent()
     path = tmp_path / "decision.onnx"

@@ -119,6 +119,7 @@ def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(trained_run:
     assert "of step 600, expected 620" in err
 
 
+@pytest.mark.slow
 def test_a_failed_parity_exits_1_and_names_the_layer(
     trained_run: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:

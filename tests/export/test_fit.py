@@ -37,6 +37,7 @@ def limits(fit: ChipFit, layer: str) -> dict[str, tuple[float, float]]:
     return {limit.resource: (limit.needs, limit.has) for limit in found.limits}
 
 
+@pytest.mark.slow
 def test_built_in_chips_answer_as_stored() -> None:
     """Bit for bit what was answered when chips were still written in Python."""
     stored, now = json.loads(GOLDEN.read_text()), json.loads(json.dumps(golden_fits()))
@@ -154,6 +155,7 @@ def test_what_forbids_every_size_is_named() -> None:
     assert fit.change == ""
 
 
+@pytest.mark.slow
 @given(st.lists(st.lists(st.integers(0, 4), unique=True, max_size=4), max_size=5))
 @settings(max_examples=150, deadline=None)
 def test_assignment_is_as_good_as_brute_force(options: list[list[int]]) -> None:
@@ -250,6 +252,7 @@ def test_shapes_of_real_networks(settings: dict[str, str]) -> None:
         assert [layer["layer"] for layer in again["layers"]] == [shape.name for shape in shapes]
 
 
+@pytest.mark.slow
 def test_inputs_that_are_no_spikes_need_a_host() -> None:
     def host(chip: str, **settings: object) -> str:
         return check_fit(layer_shapes(fold_agent(make_agent(**settings))), chip).conditions[0]
@@ -292,6 +295,7 @@ def sinabs(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
             del sys.modules[name]
 
 
+@pytest.mark.slow
 def test_speck_as_sinabs_has_it(sinabs: SimpleNamespace) -> None:
     """Memory of each layer, the cores that hold it, and whether all of them find one."""
     spiking = importlib.import_module("sinabs.layers").IAFSqueeze(batch_size=1)

@@ -37,6 +37,7 @@ def nir_file(tmp_path: Path) -> Path:
     return tmp_path / "a.nir"
 
 
+@pytest.mark.slow
 def test_the_child_reads_what_nir_reads(nir_file: Path) -> None:
     mine, theirs = read_nir(nir_file), nir.read(nir_file)
     assert mine.edges == theirs.edges
@@ -53,6 +54,7 @@ def refuse_nir(path: Path, reason: str) -> None:
     assert str(refused.value).isprintable()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -237,6 +239,7 @@ def test_onnx_that_reaches_elsewhere_or_has_no_bound(made: onnx.ModelProto, reas
         onnx_session(made.SerializeToString() or b"")
 
 
+@pytest.mark.slow
 def test_a_model_is_tried_in_a_child_before_it_is_opened_here(tmp_path: Path) -> None:
     side = numpy_helper.from_array(np.array([2**33], np.int64), "side")
     large = model(helper.make_node("ConstantOfShape", ["side"], ["z"]), IDENTITY, initializer=(side,))

@@ -84,6 +84,7 @@ def test_the_two_subtractions_by_hand() -> None:
         NirInterpreter(graph, reset="soft")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("dt", [1.0, 1e-3, 2.1e-4])
 def test_a_step_longer_than_a_time_constant_is_refused(dt: float, snntorch_file, tmp_path: Path) -> None:

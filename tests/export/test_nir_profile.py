@@ -68,6 +68,7 @@ def convolution(weight: np.ndarray, side: tuple[int, int], stride: Any, padding:
     return nir.NIRGraph(nodes, edges, metadata={"dt": 1.0}, type_check=False)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     channels=st.integers(1, 3),
@@ -268,6 +269,7 @@ def dense_hand_count(present: np.ndarray, weight: np.ndarray) -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("binary", [True, False])
 def test_a_foreign_graph_equals_a_dense_hand_count(binary: bool, tmp_path: Path) -> None:
     written = foreign()
@@ -299,6 +301,7 @@ def test_a_foreign_graph_equals_a_dense_hand_count(binary: bool, tmp_path: Path)
     assert (fc.neurons, fc.outputs, fc.spikes_T, fc.neuron_updates_per_decision) == (0, 4, (), 0)
 
 
+@pytest.mark.slow
 def test_a_recurrent_layer_shares_its_neurons(tmp_path: Path) -> None:
     """The neurons belong to the weights that come first; what a Scale has changed is multiplied."""
     eye = np.eye(2, dtype=np.float32)

@@ -54,6 +54,7 @@ def hooked_counts(agent, x: np.ndarray, task: int) -> dict[str, int]:
     return counts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_counts_equal_hooks_on_the_network(variant: str) -> None:
     agent = make_agent(**VARIANTS[variant])
@@ -79,6 +80,7 @@ def test_counts_equal_hooks_on_the_network(variant: str) -> None:
         assert {layer.name: sum(layer.spikes_T) for layer in profile.layers if layer.neurons} == by_layer
 
 
+@pytest.mark.slow
 def test_what_is_a_multiplication_and_what_an_accumulation() -> None:
     def kinds(variant: str) -> list[str]:
         agent = make_agent(**VARIANTS[variant])
@@ -259,6 +261,7 @@ def test_the_commit_is_that_of_this_package_only(tmp_path: Path) -> None:
     assert answer.stdout.strip() == "unknown"
 
 
+@pytest.mark.slow
 def test_rounded_weights_are_those_of_a_layers_own_step() -> None:
     agent = make_agent()
     for task in range(3):

@@ -151,6 +151,7 @@ def test_several_runs_in_one_report(trained_run: Path, tmp_path: Path, run_comma
     assert json.loads(out) == json.loads((tmp_path / "comparison.json").read_text())
 
 
+@pytest.mark.slow
 def test_names_are_escaped(profiled: Path) -> None:
     facts = json.loads((profiled / "profile.json").read_text())
     facts["run"] = "<script>alert(1)</script>"

@@ -23,6 +23,7 @@ from tests.export.export_cases import VARIANTS, RunCommand, make_agent, observat
 SPIKING = [name for name, of in VARIANTS.items() if METHOD_TRAITS[of.get("method", "SwitchMT")].spiking]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", SPIKING)
 def test_an_unrolled_file_is_bitwise_the_file_with_scan(variant: str) -> None:
     agent = make_agent(**VARIANTS[variant])

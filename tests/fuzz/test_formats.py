@@ -45,6 +45,7 @@ def test_good_files_are_taken(name: str, tmp_path: Path) -> None:
         assert set(taken.values()) == {"taken"}, taken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "file"), [(name, file) for name, files in EXPECTED.items() for file in files])
 def test_every_fault_that_was_found_stays_mended(name: str, file: str, tmp_path: Path) -> None:
     line = outcome(name, tmp_path, (CORPUS / name / file).read_bytes())

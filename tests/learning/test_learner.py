@@ -113,6 +113,7 @@ def test_the_learning_rate_falls_to_zero_over_updates_and_a_state_continues_it(e
     assert moved[4] == moved[5] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["eager", pytest.param("native", marks=builds)])
 def test_losses_and_clipping_change_the_update(engine: str) -> None:
     results = set()

@@ -51,6 +51,7 @@ def played(**settings: Any) -> Training:
     return part
 
 
+@pytest.mark.slow
 @given(steps=STEPS, discount=st.sampled_from([0.0, 0.9, 1.0]), clip=st.booleans())
 def test_the_scale_is_the_root_mean_square_of_the_returns_so_far(steps: Any, discount: float, clip: bool) -> None:
     scale = ReturnScale(2, discount, clip)

@@ -53,6 +53,7 @@ def at(state: dict[str, Any], place: tuple[str, ...]) -> dict[str, Any]:
     return state
 
 
+@pytest.mark.slow
 def test_whatever_is_missing_is_one_line(state: dict[str, Any]) -> None:
     accepted, messages = set(), {}
     part, damaged = training(), copy.deepcopy(state)

@@ -305,6 +305,7 @@ def test_the_policy_sees_every_episode_end_of_a_step_in_which_it_leaves(
     assert sum(isinstance(event.decision, SwitchTo) for event in decided) == 6
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_stops_the_run() -> None:
     training = counting(small_config(learning={"learning_rate": 1e30, "clip_rewards": False}))
     with pytest.raises(TrainingFailed, match=r"not finite .* try a lower learning\.learning_rate"):

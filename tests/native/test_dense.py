@@ -79,6 +79,7 @@ def test_convolutions_and_their_gradients(dtype, images, channels, sides, kernel
     assert grad_weight.dtype == grad_bias.dtype == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 @settings(max_examples=60, deadline=None)
 @given(

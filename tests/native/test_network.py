@@ -129,6 +129,7 @@ def test_networks_without_bits_compute_the_same_to_rounding(
         torch.testing.assert_close(grad, their_grads[name], rtol=1e-3, atol=1e-4 * scale + 1e-7, msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["SwitchMT", "DSQN_D", "MTSpark_AD"])
 @pytest.mark.parametrize("dendrites", ["shared", "per_neuron"])
 def test_normalized_streams_equal_eager(method: str, dendrites: str) -> None:

@@ -216,6 +216,7 @@ def test_sums_of_n_steps_equal_the_naive_list(
         assert ours[key][3] == pytest.approx(factor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("slots", [700, SEGMENT_SLOTS, 2500])
 def test_stored_and_loaded_is_the_same(slots: int, form: str) -> None:

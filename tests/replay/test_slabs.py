@@ -15,6 +15,7 @@ from switchmt_snn.replay.slabs import SLAB_BYTES, Place, Slabs
 LENGTHS = (1, 7, 1000, SLAB_BYTES // 3, SLAB_BYTES // 2, SLAB_BYTES, SLAB_BYTES + 1, 3 * SLAB_BYTES)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 10**6)), max_size=60))
 def test_slabs_against_a_dict(operations: list[tuple[int, int]]) -> None:

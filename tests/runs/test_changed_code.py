@@ -89,6 +89,7 @@ def continued(folder: Path, steps: int) -> list[str]:
     return [text for text in notes.texts if text.startswith("warning: the code")]
 
 
+@pytest.mark.slow
 def test_the_modules_of_a_runs_plugins_are_hashed(folder: Path) -> None:
     facts = json.loads((folder / "run" / "environment.json").read_text())
     assert set(facts["files_sha256"]) == set(MODULES)
@@ -107,6 +108,7 @@ def test_a_module_that_changed_before_a_resume_is_named_once(folder: Path) -> No
     assert continued(folder, 90) == [], "told once"
 
 
+@pytest.mark.slow
 def test_a_parameter_that_the_checkpoint_does_not_have_is_one_line(folder: Path) -> None:
     line = "        self.amount = torch.nn.Parameter(torch.tensor(0.75))"
     edit(folder / "my_neurons.py", line, f"{line.replace('amount', 'gain')}\n{line}")
@@ -116,6 +118,7 @@ def test_a_parameter_that_the_checkpoint_does_not_have_is_one_line(folder: Path)
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_state_that_the_checkpoint_does_not_have_is_one_line(folder: Path) -> None:
     edit(folder / "my_policies.py", 'SAVED = ("returns",)', 'SAVED = ("returns", "best")')
     edit(

@@ -38,6 +38,7 @@ def stored(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (run / "evaluations").iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change", [{"epsilon": 0.5}, {"epsilon": 0.0500001}, {"num_envs": 1}, {"seed": 3}, {"episodes": 3}]
 )
@@ -49,6 +50,7 @@ def test_an_evaluation_under_another_protocol_leaves_the_others_alone(finished: 
     assert before.items() <= after.items()
 
 
+@pytest.mark.slow
 def test_a_runs_worth_is_the_evaluation_with_the_most_episodes_not_the_newest(finished: Path) -> None:
     evaluate(finished, episodes=1)
     large = evaluate(finished, episodes=6)
@@ -65,6 +67,7 @@ def test_a_runs_worth_is_the_evaluation_with_the_most_episodes_not_the_newest(fi
     assert evaluations.best_known(100, "Acrobot-v1") is None
 
 
+@pytest.mark.slow
 def test_only_an_evaluation_under_the_runs_own_protocol_ends_it(finished: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     os.rename(finished, run)

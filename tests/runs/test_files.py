@@ -28,6 +28,7 @@ def test_other_tasks_have_another_file_name(one: tuple[str, ...], two: tuple[str
     assert (file_name(*one) == file_name(*two)) == (one == two)
 
 
+@pytest.mark.slow
 @given(LISTS)
 def test_file_names_are_safe_and_short(tasks: tuple[str, ...]) -> None:
     name = file_name(*tasks)

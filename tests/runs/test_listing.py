@@ -43,6 +43,7 @@ def test_runs_come_by_the_time_they_began_with_their_facts(folder: Path) -> None
         assert run.bytes == sum(path.stat().st_size for path in files)
 
 
+@pytest.mark.slow
 def test_steps_status_time_and_scores_of_stored_runs() -> None:
     lagging = summarize(ROOT / "results" / "atari" / "lagging-s1")
     assert (lagging.status, lagging.total_steps) == ("stopped", 3_000_000)
@@ -66,6 +67,7 @@ def test_a_run_that_is_in_use_is_running_and_asking_does_not_disturb_it(folder: 
     assert not RunFolder(folder / "gym").in_use
 
 
+@pytest.mark.slow
 def test_damaged_folders_are_one_line_each_and_the_others_are_listed(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

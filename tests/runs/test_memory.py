@@ -39,6 +39,7 @@ def planned(**changes: Any) -> tuple[ExperimentConfig, TaskSuite, MemoryEstimate
     return config, suite, describe_method(config, suite).memory
 
 
+@pytest.mark.slow
 def test_a_replay_takes_no_more_than_the_steps_of_the_run_fill() -> None:
     learning = {"replay_capacity_steps": 6_000, "learning_starts_steps": 600}
     for total, slots in ((6_000, 6_000), (9_000, 9_000), (18_000, 18_000), (10**6, 18_000)):
@@ -76,6 +77,7 @@ def test_a_run_that_does_not_fit_is_refused_with_numbers() -> None:
         require_memory(estimate, config, suite, available=GIB // 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learning", [{"replay_compression": "none"}, {"replay_compression": "zstd"}, {}])
 @pytest.mark.parametrize("total_steps", [50_000, 10**7])
 @pytest.mark.parametrize("room", [0.01, 0.3, 0.999])
@@ -153,6 +155,7 @@ def test_the_peak_is_of_this_program_and_not_of_the_one_that_started_it() -> Non
     assert int(done.stdout) < held.nbytes < peak_bytes()
 
 
+@pytest.mark.slow
 def test_a_replay_that_cannot_fit_is_refused_before_it_is_made(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -72,6 +72,7 @@ def test_an_agent_no_better_than_random_play_and_a_silent_layer_are_limits(cartp
     assert f"{layer['silent']} of {layer['neurons']} neurons of {layer['name']} never fire" in limits
 
 
+@pytest.mark.slow
 def test_an_export_has_a_card_with_the_hash_of_every_file(cartpole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     export(cartpole, ExportSettings(int8=True, parity_decisions=16), out=out)

@@ -73,6 +73,7 @@ def test_an_unknown_checkpoint_is_refused(old_run: Path) -> None:
         load_agent(old_run, checkpoint="bset")
 
 
+@pytest.mark.slow
 def test_old_onnx_files_decide_as_the_old_run_does(old_run: Path) -> None:
     agent, exported = load_agent(old_run, device="cpu"), load_exported(old_run, "onnx")
     assert agent.suite.names

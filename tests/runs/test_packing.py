@@ -60,6 +60,7 @@ def test_the_best_weights_can_be_packed(finished: Path, tmp_path: Path) -> None:
     assert {path.name.split("_")[0] for path in (packed / "evaluations").iterdir()} == {f"step-{best.step:012d}"}
 
 
+@pytest.mark.slow
 def test_training_cannot_go_on_from_a_packed_run(finished: Path, tmp_path: Path) -> None:
     packed = pack(finished, tmp_path / "mine")
     before = bytes_of(packed)
@@ -146,6 +147,7 @@ def test_a_folder_of_ones_own_comes_first_and_unknown_names_are_told_the_known(o
     assert open_run("pretrained/small", to_write=True).path == Path("pretrained/small")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", packing.pretrained_names())
 def test_the_packages_own_runs_are_whole_and_hold_their_scores(name: str) -> None:
     folder = open_run(f"pretrained/{name}")

@@ -162,6 +162,7 @@ def test_a_run_of_an_older_version_is_planned_as_it_was(tmp_path: Path) -> None:
     assert (made.config.learning.engine, made.config.learning.replay_compression) == ("eager", "none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begun_with", [True, False])
 def test_a_run_goes_on_clipping_as_it_began(begun_with: bool) -> None:
     """A gym run of a version that clipped by default is continued by the same config, which does not name it."""

@@ -61,6 +61,7 @@ def test_a_flag_that_a_run_cannot_take_is_named(tmp_path: Path, capsys: pytest.C
     assert "network.method ('SwitchMT' -> 'DQN')" in error
 
 
+@pytest.mark.slow
 def test_a_printed_config_can_be_varied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["train", "quickstart", "--print-config"])

@@ -80,6 +80,7 @@ def test_the_config_names_every_encoding_and_no_other() -> None:
     assert set(ENCODINGS) == set(ENCODING_NAMES)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     name=st.sampled_from(sorted(ENCODINGS)),

@@ -95,6 +95,7 @@ def test_alif_learns_through_the_rise_of_its_threshold() -> None:
     assert current.grad.flatten().tolist() == pytest.approx([-0.5 * slope**2, slope])
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     beta=st.floats(0.0, 1.0, width=32), reset=st.sampled_from(RESETS), seed=st.integers(0, 2**31), T=st.integers(1, 9)
@@ -152,6 +153,7 @@ def test_every_form_equals_the_step(form, reset, beta, alpha, threshold, surroga
         torch.testing.assert_close(grad, expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     reset=st.sampled_from(RESETS),

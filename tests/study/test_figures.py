@@ -42,6 +42,7 @@ def evaluated(finished: tuple[Study, StudyFolder]) -> tuple[Study, StudyFolder, 
     return study, folder, results
 
 
+@pytest.mark.slow
 def test_profiles_are_shares_of_scores_above_thresholds(
     evaluated: tuple[Study, StudyFolder, list[TrialResult]],
 ) -> None:
@@ -59,6 +60,7 @@ def test_profiles_are_shares_of_scores_above_thresholds(
         assert any(low < high for low, high in zip(series.low, series.high, strict=True))  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_a_matrix_is_what_each_task_lost_since_its_best(
     evaluated: tuple[Study, StudyFolder, list[TrialResult]],
 ) -> None:
@@ -84,6 +86,7 @@ def test_a_matrix_is_what_each_task_lost_since_its_best(
         assert any(span.share > 0 for span in matrix.spans)
 
 
+@pytest.mark.slow
 def test_without_curves_references_or_switches_a_figure_is_left_out(
     evaluated: tuple[Study, StudyFolder, list[TrialResult]],
 ) -> None:

@@ -97,6 +97,7 @@ baseline: both
     assert study.references == {"CartPole-v1": "alone", "Acrobot-v1": -100.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(studies()))
 def test_studies_of_the_package_can_be_run(name: str) -> None:
     study = load_study(name, ["total_steps=2000"], [1])

@@ -59,6 +59,7 @@ def table(folder: StudyFolder, name: str) -> dict[str, dict[str, Any]]:
     return {row["variant"]: row for row in found["rows"]}
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_the_final_evaluations(finished: tuple[Study, StudyFolder]) -> None:
     _, folder = finished
     rows = rows_of(folder.path / "scores.csv")

@@ -266,6 +266,7 @@ def test_a_folder_takes_more_trials_but_no_other_ones(tmp_path: Path) -> None:
     held.release()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

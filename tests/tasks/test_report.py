@@ -42,6 +42,7 @@ def test_every_suites_examples_repeat_themselves_in_any_thread(suite: str) -> No
         assert report.steps_per_s > 0
 
 
+@pytest.mark.slow
 def test_the_facts_of_a_plain_environment() -> None:
     report = report_of("Offset")
     assert report.actions == (-1, 0, 1)
@@ -54,6 +55,7 @@ def test_the_facts_of_a_plain_environment() -> None:
     assert report.notes == ("every seed gives the same play: episodes of an evaluation differ by random actions only",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "note"),
     [
@@ -142,6 +144,7 @@ def test_warnings_of_gymnasiums_checker_are_notes() -> None:
     assert not any("__module__" in note for note in report_of("Outdated").notes), "meant for the library's author"
 
 
+@pytest.mark.slow
 def test_what_training_would_refuse_is_refused() -> None:
     with pytest.raises(TaskError, match="gave the rewards"):
         report_of("NanReward")
@@ -150,6 +153,7 @@ def test_what_training_would_refuse_is_refused() -> None:
     assert report_of("Combined", wrappers=("FlattenAction",)).actions == tuple(range(6))
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["check-env", f"{MODULE}:ChannelsFirst-v0", "--steps", "40"]
     with pytest.raises(SystemExit) as done:
@@ -220,6 +224,7 @@ def test_a_run_says_before_it_starts_that_an_environment_does_not_repeat_itself(
     assert note.startswith(f"warning: task '{MODULE}:OwnUnseeded-v0' differs at step ")
 
 
+@pytest.mark.slow
 def test_a_run_says_before_it_starts_that_it_clips_rewards() -> None:
     """Clipping is Atari's custom: elsewhere it can change what is best."""
     names = [f"{MODULE}:Plain-v0", f"{MODULE}:LargeRewards-v0"]

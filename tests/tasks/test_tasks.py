@@ -126,6 +126,7 @@ def test_an_episode_is_a_function_of_seed_and_actions(suite_name: str) -> None:
         two.close()
 
 
+@pytest.mark.slow
 def test_truncation_is_told_apart() -> None:
     suite = make_suite(TasksConfig(names=("pong",), max_episode_frames=40))
     play = Play(suite, 0, 1)
@@ -162,6 +163,7 @@ def test_minatar_channels_are_padded() -> None:
     play.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -194,6 +196,7 @@ def test_an_environment_that_does_not_repeat_itself_is_noticed() -> None:
     assert not Play(suite, 0, 1).load_state_dict(play.state_dict())
 
 
+@pytest.mark.slow
 def test_the_minimal_action_mask_keeps_all_outputs_and_their_meaning() -> None:
     suite = make_suite(TasksConfig(minimal_action_mask=True))
     assert suite.num_actions == 18

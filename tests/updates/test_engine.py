@@ -100,6 +100,7 @@ def test_compiled_equals_eager_to_rounding_for_every_task(network: dict[str, Any
     _compare_to_rounding("compiled", network)
 
 
+@pytest.mark.slow
 @builds
 @pytest.mark.parametrize(
     "network",
@@ -144,6 +145,7 @@ def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any])
     _compare_to_rounding("native", network)
 
 
+@pytest.mark.slow
 @builds
 @pytest.mark.parametrize("copies", [1, 8, 40])  # 40: more lanes than a panel of few
 @pytest.mark.parametrize(

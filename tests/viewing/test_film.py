@@ -202,6 +202,7 @@ def test_a_video_has_every_frame_in_order(ending: str, tmp_path: Path) -> None:
     assert [len(gains) for gains in facts["tasks"][0]["gains"].values()] == [1, 1]
 
 
+@pytest.mark.slow
 def test_the_neurons_that_are_drawn_vary_and_differ() -> None:
     agent = watched(MINATAR)
     play = protocol(agent)
@@ -255,6 +256,7 @@ def test_what_cannot_be_filmed_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["somebody's.txt"]
 
 
+@pytest.mark.slow
 def test_a_film_that_fails_leaves_nothing(tmp_path: Path) -> None:
     agent = watched(CARTPOLE)
     decide: Callable[..., Any] = agent.q_values

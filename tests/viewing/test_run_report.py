@@ -208,6 +208,7 @@ def test_a_run_without_any_episode_has_a_page(tmp_path: Path) -> None:
     assert "No episode has ended yet" in "".join(page.text)
 
 
+@pytest.mark.slow
 def test_links_go_to_what_is_there(tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "minatar", run)
@@ -221,6 +222,7 @@ def test_links_go_to_what_is_there(tmp_path: Path) -> None:
         assert any(link.endswith("play.gif") for link in links)
 
 
+@pytest.mark.slow
 def test_wrong_folders_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     for words, said in (
