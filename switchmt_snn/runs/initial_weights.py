@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,8 @@ from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.training import observation_spec
 from switchmt_snn.runs.checkpoint import fitting_weights
-from switchmt_snn.runs.packing import open_run
+from switchmt_snn.runs.folder import read_environment
+from switchmt_snn.runs.packing import open_run, pretrained_names
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -76,7 +76,14 @@ def read_initial_weights(config: ExperimentConfig, suite: TaskSuite, folder: Pat
     run = config.initial_weights
     if run is None:
         return None
-    source = open_run(run)
+    try:
+        source = open_run(run)
+    except RunFolderError as error:
+        names = ", ".join(f"pretrained/{name}" for name in pretrained_names())
+        raise RunFolderError(
+            f"initial_weights is {run} ({str(error).partition(', expected')[0]}), expected a run folder or one of "
+            f"{names}; switchmt-snn runs lists the run folders"
+        ) from error
     theirs = source.config()
     changed = {
         key: values
@@ -94,20 +101,10 @@ def read_initial_weights(config: ExperimentConfig, suite: TaskSuite, folder: Pat
     step, weights, _ = source.checkpoints().load_model()
     found = InitialWeights(run, step, weights)
     if folder is not None:
-        began = _recorded(folder)
-        if began is not None and began.get("sha256") != found.facts()["sha256"]:
+        began = read_environment(folder).get("initial_weights")
+        if isinstance(began, dict) and began.get("sha256") != found.facts()["sha256"]:
             raise ConfigError(
                 f"initial_weights is {run}, whose weights are no longer those that {folder} began with (step "
                 f"{began.get('step')}), expected the same ones; start a new run with --run"
             )
     return found
-
-
-def _recorded(folder: Path) -> dict[str, Any] | None:
-    try:
-        recorded = json.loads((folder / "environment.json").read_bytes()).get("initial_weights")
-    except (OSError, ValueError, AttributeError) as error:
-        raise RunFolderError(
-            f"{folder / 'environment.json'} cannot be read ({error!s:.80}); start a new run"
-        ) from error
-    return recorded if isinstance(recorded, dict) else None

@@ -105,12 +105,16 @@ def test_weights_of_other_tasks_or_networks_are_refused(
 
 
 def test_a_name_that_is_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(RunFolderError):
+    with pytest.raises(
+        RunFolderError, match=r"initial_weights is .*nothing .*expected a run folder or one of pretrained"
+    ):
         train(config(initial_weights=str(tmp_path / "nothing")), tmp_path / "run")
     with pytest.raises(SystemExit) as stop:
         main(["train", "cartpole", "--initial-weights", "pretrained/pang", "--run", str(tmp_path / "run")])
     assert stop.value.code == 2
-    assert "expected one of" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no pretrained run 'pang'" in said
+    assert "expected a run folder or one of pretrained/cartpole, pretrained/pong" in said
 
 
 def test_a_pretrained_network_learns_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
