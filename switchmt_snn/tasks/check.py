@@ -18,6 +18,12 @@ from switchmt_snn.tasks.suite import TaskSuite
 STEPS_BEFORE_TRAINING = 20
 """Steps per task for which tasks from outside are played before a run starts."""
 
+FROM_ITS_SEED = (
+    "take every random number from self.np_random, which super().reset(seed=seed) seeds, and set everything else anew "
+    "in reset"
+)
+"""What makes an episode a function of its seed."""
+
 
 @contextmanager
 def warnings_unless_refused() -> Iterator[None]:
@@ -59,7 +65,13 @@ def check_before_training(config: ExperimentConfig, tasks: TaskSuite) -> tuple[s
             if step is not None:
                 notes.append(
                     f"warning: task {name!r} differs at step {step} when it is played again with the same seed and "
-                    "actions: evaluations do not repeat, and a resumed run is not exact (switchmt-snn check-env)"
+                    f"actions: evaluations do not repeat, and a resumed run is not exact; {FROM_ITS_SEED}"
+                )
+            elif not starts_afresh(tasks, task, STEPS_BEFORE_TRAINING):
+                notes.append(
+                    f"warning: task {name!r} plays an episode otherwise after other episodes than in an environment "
+                    "made anew, with the same seed and actions: evaluations depend on their number of copies, and a "
+                    f"resumed run is not exact; {FROM_ITS_SEED}"
                 )
     return tuple(notes)
 
@@ -112,6 +124,29 @@ def journal(tasks: TaskSuite, task: int, steps: int, seed: int = 0, actions_seed
         return seen
     finally:
         play.close()
+
+
+def starts_afresh(tasks: TaskSuite, task: int, steps: int, seed: int = 0) -> bool:
+    """Whether an episode's first steps are the same after another episode as in an environment made anew."""
+    play = Play(tasks, task, 1)
+    try:
+        valid = np.flatnonzero(tasks.valid_actions_KA[task])
+        anew = one_episode(play, valid, seed, steps)
+        return differs_from(anew, one_episode(play, valid, seed, steps)) is None
+    finally:
+        play.close()
+
+
+def one_episode(play: Play, valid: npt.NDArray[np.int64], seed: int, steps: int) -> Journal:
+    """The first steps of an episode of a fixed seed with fixed actions, in a play of one copy."""
+    rng = np.random.default_rng(seed)
+    seen: Journal = [(play.begin(np.zeros(1, np.int64), np.asarray([episode_seed(seed, play.task, 0)])).copy(),)]
+    for _ in range(steps):
+        result = play.step(rng.choice(valid, 1))
+        seen.append((result.frames.copy(), result.rewards, result.terminated, result.truncated))
+        if len(result.ended):
+            break
+    return seen
 
 
 def differs_from(first: Journal, second: Journal) -> int | None:

@@ -21,8 +21,9 @@ Env = gymnasium.Env[Any, Any]
 class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
     """One copy of an environment: its observations are the suite's frames, its actions count from 0.
 
-    Every observation is compared with the environment's own space. An environment from outside Gymnasium and MinAtar
-    may draw from the global generators and from its spaces; an episode is a function of its seed all the same.
+    Every observation is compared with the environment's own space. An environment from outside Gymnasium and MinAtar,
+    and its wrappers may draw from the global generators and from their spaces; an episode is a function of its seed
+    all the same.
     """
 
     def __init__(
@@ -51,8 +52,7 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         outside = is_outside(env)
         self._generators = OwnGenerators() if outside else None
         self._drawing = OwnGenerators() if outside else _NOTHING
-        if outside:
-            _give_own_spaces(env)
+        self._spaces = _own_spaces(env) if outside else []
         low, high = (0, 255) if self._dtype == np.uint8 else (-np.inf, np.inf)
         self.observation_space = gymnasium.spaces.Box(low, high, frame_shape, self._dtype.type)
 
@@ -61,7 +61,8 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         assert seed is not None, "an episode is a function of its seed"
         if self._generators is not None:
             self._generators.seed(seed)
-            _seed_spaces(self.env, seed)
+            for space in self._spaces:
+                space.seed(seed)
         if self._before_reset is not None:
             self._before_reset(self.env)
         with self._generators or _NOTHING:
@@ -177,20 +178,28 @@ def first_action(env: Env) -> int:
 
 def is_outside(env: Env) -> bool:
     """Whether an environment, or one of its wrappers, comes from another package than Gymnasium and MinAtar."""
+    return any(type(layer).__module__.partition(".")[0] not in ("gymnasium", "minatar") for layer in _layers(env))
+
+
+def _layers(env: Env) -> list[Env]:
+    """An environment's wrappers, from the outermost on, and the environment that they wrap."""
     layers = [env]
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
-    return any(type(layer).__module__.partition(".")[0] not in ("gymnasium", "minatar") for layer in layers)
+    return layers
 
 
-def _give_own_spaces(env: Env) -> None:
-    """Copies may share spaces that are attributes of their class, and with them the generator of ``sample``."""
-    for name in ("action_space", "observation_space"):
-        with contextlib.suppress(AttributeError):  # a property, which makes its own
-            setattr(env.unwrapped, name, deepcopy(getattr(env.unwrapped, name)))
+def _own_spaces(env: Env) -> list[gymnasium.Space[Any]]:
+    """The spaces of an environment and its wrappers, of which code may ``sample``; copies of an environment share none.
 
-
-def _seed_spaces(env: Env, seed: int) -> None:
-    """Seed what ``sample`` draws from: an environment may call it."""
-    for space in (env.unwrapped.action_space, env.unwrapped.observation_space):
-        space.seed(seed)
+    A space that is an attribute of a class is shared by all its objects, and with it the generator of ``sample``.
+    """
+    found = []
+    for layer in _layers(env):
+        shared = {name: value for one in reversed(type(layer).__mro__) for name, value in vars(one).items()}
+        for name, value in {**shared, **vars(layer)}.items():
+            if isinstance(value, gymnasium.Space):
+                own = deepcopy(value)
+                setattr(layer, name, own)
+                found.append(own)
+    return found

@@ -16,6 +16,7 @@ from switchmt_snn.config.plugins import import_plugin_module, is_plugin, load_pl
 from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
 from switchmt_snn.errors import TaskError, did_you_mean, nearest
 from switchmt_snn.tasks.gym_copies import Env
+from switchmt_snn.tasks.randomness import OwnGenerators
 
 _FORM = re.compile(r"(?:(?P<module>[^\W\d]\w*(?:\.[^\W\d]\w*)*):)?(?P<id>(?:[\w-]+/)?\w[\w.-]*)")
 """Of a task id: the module that registers it, then Gymnasium's namespace and name."""
@@ -110,10 +111,11 @@ def make_environment(name: str, wrappers: Sequence[str] = (), pictured: bool = F
     if module is not None:
         _import(name, module)
     expected = "a Gymnasium environment with observation_space and action_space"
-    with user_code(f"task {name!r} cannot be made", expected, TaskError):
-        env = _registered(name, env_id, pictured)
-    for wrapper in wrappers:
-        env = _wrapped(name, env, wrapper)
+    with OwnGenerators():  # what a constructor draws (a maze) is the same each time
+        with user_code(f"task {name!r} cannot be made", expected, TaskError):
+            env = _registered(name, env_id, pictured)
+        for wrapper in wrappers:
+            env = _wrapped(name, env, wrapper)
     return env
 
 

@@ -11,11 +11,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import TaskError
-from switchmt_snn.tasks.check import differs_from, journal
+from switchmt_snn.tasks.check import FROM_ITS_SEED, differs_from, journal, one_episode
 from switchmt_snn.tasks.gym_copies import GymCopies
 from switchmt_snn.tasks.gym_make import make_environment
 from switchmt_snn.tasks.gym_spaces import frame_layout
@@ -61,7 +60,7 @@ class EnvironmentReport:
         repeats: whether the same seed and actions give the same play in an environment made anew.
         starts_afresh: whether an episode is the same after other episodes as in an environment made anew.
         seeds_differ: whether another seed gives another play.
-        draws_globally: whether it draws from (or seeds) the generators of ``random`` or ``numpy.random``.
+        draws_globally: whether it draws from (or seeds) the generators of ``random``, ``numpy.random`` or torch.
         played_in_threads: whether evaluations play it in several threads at a time.
         same_in_threads: whether several threads at a time play what one plays.
         steps_per_s: of one copy, with random actions.
@@ -254,26 +253,15 @@ class _Played:
     def compare_start(self, tasks: TaskSuite, steps: int) -> None:
         """Whether an episode's first steps, after those played, are as in an environment made anew; closes the play."""
         try:
-            again = _one_episode(self._play, self._valid, self._seed, steps)
+            steps = min(steps, COMPARED_STEPS // 4)
+            again = one_episode(self._play, self._valid, self._seed, steps)
         finally:
             self._play.close()
         anew = Play(tasks, self._task, 1)
         try:
-            self.starts_afresh = differs_from(again, _one_episode(anew, self._valid, self._seed, steps)) is None
+            self.starts_afresh = differs_from(again, one_episode(anew, self._valid, self._seed, steps)) is None
         finally:
             anew.close()
-
-
-def _one_episode(play: Play, valid: npt.NDArray[np.int64], seed: int, steps: int) -> list[tuple[npt.NDArray[Any], ...]]:
-    """The first steps of an episode of a fixed seed with fixed actions."""
-    rng = np.random.default_rng(seed)
-    seen: list[tuple[npt.NDArray[Any], ...]] = [(play.begin(np.zeros(1, np.int64), np.asarray([12345])).copy(),)]
-    for _ in range(min(steps, COMPARED_STEPS // 4)):
-        result = play.step(rng.choice(valid, 1))
-        seen.append((result.frames.copy(), result.rewards, result.terminated, result.truncated))
-        if len(result.ended):
-            break
-    return seen
 
 
 def _same_in_threads(tasks: TaskSuite, task: int, steps: int, seed: int, expected: Any) -> bool:
@@ -308,11 +296,12 @@ def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None, clips:
     if not report.repeats:
         notes.append(
             "the same seed and actions do not give the same play: scores differ from one evaluation to the next, and a "
-            "resumed run is not exact; take every random number from self.np_random, which reset(seed=...) seeds"
+            f"resumed run is not exact; {FROM_ITS_SEED}"
         )
     elif not report.starts_afresh:
         notes.append(
-            "an episode depends on the episodes before it: a resumed run is not exact; set everything anew in reset"
+            "an episode depends on the episodes before it: scores depend on the number of copies, and a resumed run is "
+            f"not exact; {FROM_ITS_SEED}"
         )
     if report.steps_per_s < SLOW_STEPS_PER_S:
         hours = 100_000 / report.steps_per_s / 3600

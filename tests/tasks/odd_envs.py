@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 
 
@@ -244,11 +245,66 @@ class GlobalRandom(Plain):
         return random.random() + np.random.rand() + float(np.random.randn())
 
 
+class TorchRandom(Plain):
+    """Draws from torch's process-wide generator."""
+
+    def reward(self, action: Any) -> Any:
+        return float(torch.rand(()))
+
+
+class DrawnWhenMade(Plain):
+    """A level that the constructor draws."""
+
+    def __init__(self) -> None:
+        self.level = random.random() + float(torch.rand(()))
+
+    def reward(self, action: Any) -> Any:
+        return self.level
+
+
 class SampledActions(Plain):
     """Draws from its spaces, which reset's seed does not reach either."""
 
     def reward(self, action: Any) -> Any:
         return float(self.action_space.sample()) + float(self.observation_space.sample()[0])
+
+
+class SampledGoal(Plain):
+    """Draws from a space that is neither of actions nor of observations."""
+
+    goals = Box(-1.0, 1.0, (2,), np.float32)
+
+    def reward(self, action: Any) -> Any:
+        return float(self.goals.sample()[0])
+
+
+class Sampling(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """A wrapper that draws from an action space of its own."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.action_space = Discrete(9)
+
+    def step(self, action: Any) -> Any:
+        observation, _, ended, cut, info = self.env.step(action)
+        return observation, float(self.action_space.sample()), ended, cut, info
+
+
+class SeededWhenMade(Plain):
+    """A generator of its own that the constructor seeds, so that reset's seed does not reach it."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+
+    def reward(self, action: Any) -> Any:
+        return self.rng.random()
+
+
+class FromItsSeed(Plain):
+    """What the warnings about random numbers ask for."""
+
+    def reward(self, action: Any) -> Any:
+        return self.np_random.random()
 
 
 class OwnUnseeded(Plain):

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import ConfigError, TaskError
@@ -225,9 +226,20 @@ def test_wrappers_that_do_not_exist_or_do_not_fit_are_named() -> None:
         make_suite(TasksConfig(suite="minatar", names=("breakout",), wrappers=("FlattenObservation",)))
 
 
-@pytest.mark.parametrize("name", ["GlobalRandom", "SampledActions"])
-def test_episodes_that_draw_from_global_generators_are_functions_of_their_seed(name: str) -> None:
-    suite = suite_of(name)
+@pytest.mark.parametrize(
+    ("name", "wrappers"),
+    [
+        ("GlobalRandom", ()),
+        ("TorchRandom", ()),
+        ("SampledActions", ()),
+        ("SampledGoal", ()),
+        ("Plain", (f"{MODULE}:Sampling",)),
+    ],
+)
+def test_episodes_that_draw_from_what_reset_does_not_seed_are_functions_of_their_seed(
+    name: str, wrappers: tuple[str, ...]
+) -> None:
+    suite = suite_of(name, wrappers=wrappers)
     alone = rewards(suite)
     assert rewards(suite) == alone
     assert [row[0] for row in rewards(suite, num_envs=3)] == [row[0] for row in alone]
@@ -235,14 +247,26 @@ def test_episodes_that_draw_from_global_generators_are_functions_of_their_seed(n
 
 
 def test_the_global_generators_of_everybody_else_stay_as_they_are() -> None:
-    random.seed(5)
-    np.random.seed(5)
-    expected = (random.random(), np.random.rand(), np.random.randn())
-    random.seed(5)
-    np.random.seed(5)
-    play = begun(suite_of("GlobalRandom"))
-    play.step(np.asarray([0]))
-    assert (random.random(), np.random.rand(), np.random.randn()) == expected
+    def seeded() -> None:
+        random.seed(5)
+        np.random.seed(5)
+        torch.manual_seed(5)
+
+    def drawn() -> tuple[float, ...]:
+        return random.random(), np.random.rand(), np.random.randn(), float(torch.rand(()))
+
+    seeded()
+    expected = drawn()
+    for name in ("GlobalRandom", "TorchRandom", "DrawnWhenMade"):
+        seeded()
+        play = begun(suite_of(name))
+        play.step(np.asarray([0]))
+        assert drawn() == expected
+
+
+def test_an_environment_made_again_is_the_same_environment() -> None:
+    (level,) = {row[0] for row in rewards(suite_of("DrawnWhenMade"))}
+    assert rewards(suite_of("DrawnWhenMade"), num_envs=3)[0] == [level] * 3
 
 
 def test_only_environments_of_gymnasium_itself_are_played_in_several_threads_and_kept() -> None:

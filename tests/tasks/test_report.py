@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from switchmt_snn.cli.entry import main
 from switchmt_snn.config import from_dict
 from switchmt_snn.errors import TaskError
 from switchmt_snn.runs.plan import plan
-from switchmt_snn.tasks.check import check_before_training, warnings_unless_refused
+from switchmt_snn.tasks.check import FROM_ITS_SEED, check_before_training, warnings_unless_refused
 from switchmt_snn.tasks.registry import SUITES, make_suite
 from switchmt_snn.tasks.report import EnvironmentReport
 
@@ -72,8 +73,6 @@ def test_the_facts_of_a_plain_environment() -> None:
 )
 @pytest.mark.filterwarnings("ignore")
 def test_what_an_author_should_know_is_a_note(name: str, note: str) -> None:
-    import re
-
     assert any(re.match(note, text) for text in report_of(name).notes), report_of(name).notes
 
 
@@ -218,10 +217,19 @@ def test_warnings_are_shown_after_the_checks_and_not_with_a_refusal() -> None:
     assert [str(seen.message) for seen in heard] == ["kept"]
 
 
-def test_a_run_says_before_it_starts_that_an_environment_does_not_repeat_itself() -> None:
-    config = from_dict({"tasks": {"suite": "gym", "names": [f"{MODULE}:Plain-v0", f"{MODULE}:OwnUnseeded-v0"]}})
+@pytest.mark.parametrize(
+    ("name", "warning"),
+    [
+        ("OwnUnseeded", r"differs at step \d+ when it is played again with the same seed and actions: "),
+        ("SeededWhenMade", "plays an episode otherwise after other episodes than in an environment made anew, "),
+    ],
+)
+def test_a_run_says_before_it_starts_that_an_environment_is_no_function_of_its_seed(name: str, warning: str) -> None:
+    """FromItsSeed is the same environment after the remedy was followed."""
+    config = from_dict({"tasks": {"suite": "gym", "names": [f"{MODULE}:FromItsSeed-v0", f"{MODULE}:{name}-v0"]}})
     (note,) = check_before_training(config, make_suite(config.tasks))
-    assert note.startswith(f"warning: task '{MODULE}:OwnUnseeded-v0' differs at step ")
+    assert re.match(f"warning: task '{MODULE}:{name}-v0' {warning}", note)
+    assert note.endswith(f"; {FROM_ITS_SEED}")
 
 
 @pytest.mark.slow
