@@ -30,7 +30,7 @@ from switchmt_snn.export.formats.files import obstacles
 from switchmt_snn.export.parity.activity import chunks
 from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, play_in_pieces, recorded_plays
-from switchmt_snn.export.report.figures import energy_figure, spikes_figure
+from switchmt_snn.export.report.figures import energy_figure, rates_figures, spikes_figure
 from switchmt_snn.export.report.page import Frames, render_report
 from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.report.verdict import silent_layers, verdict
@@ -224,7 +224,7 @@ def _written(
         "targets": {target.name: asdict(target) for target in targets},
         "tasks": tasks,
     }
-    figures = [figure for figure in (energy_figure(facts), spikes_figure(facts)) if figure is not None]
+    figures = [one for one in (energy_figure(facts), spikes_figure(facts), *rates_figures(facts)) if one is not None]
     facts["figures"] = [asdict(figure) for figure in figures]
     write_atomically(folder / "profile.json", json_text(facts, indent=1).encode())
     write_atomically(folder / "layers.csv", _layers_csv(profiles).encode())
@@ -264,7 +264,7 @@ def _counted(agent: Agent, task: int, recording: Recording, decisions: int) -> T
         decisions, pieces = len(recording.observations), chunks(recording.observations)
     else:
         played = play_in_pieces(agent, recording.task, decisions, recording.epsilon, recording.seed)
-        pieces = (piece.reshape(-1, *agent.suite.observation_shape) for piece, _ in played)
+        pieces = (piece.reshape(-1, *agent.suite.observation_shape) for piece, _, _ in played)
     with progress_of(f"counting {recording.task}", decisions, "decisions") as progress:
         for piece in pieces:
             counter.add(piece)
@@ -308,7 +308,12 @@ def _summary(tasks: tuple[TaskCounts, ...], energies: list[tuple[Target, Energy]
         "by_ann": _range([energy.by_ann for _, energy in energies]),
         "by_quantised_ann": _range([energy.by_quantised_ann for _, energy in energies]),
         "chips": {
-            chip: _range([energy.total_pj for energy in of_chip]) | {"sources": len({e.target for e in of_chip})}
+            chip: _range([energy.total_pj for energy in of_chip])
+            | {
+                "sources": len({energy.target for energy in of_chip}),
+                "all_priced": not any(energy.not_included for energy in of_chip),
+                "by_ann": _range([energy.by_ann for energy in of_chip]),
+            }
             for chip, of_chip in chips.items()
         },
     }
@@ -340,7 +345,7 @@ def _headline(tasks: tuple[TaskCounts, ...], energies: list[Energy]) -> str:
     worse = [f"{energy.task} on {energy.target}" for energy, ratio in compared if ratio > 1]
     ratios = [ratio for _, ratio in compared]
     span = (
-        f"{min(ratios):.3g} to {max(ratios):.4g} of the ANN of its shape, by task and target (estimates; dense ANN, "
+        f"{min(ratios):.2f} to {max(ratios):.2f} of the ANN of its shape, by task and target (estimates; dense ANN, "
         "weights reused on neither side)"
     )
     costs = f"costs MORE than the ANN: {', '.join(worse)}; in all, {span}" if worse else f"costs {span}"

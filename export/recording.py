@@ -22,7 +22,7 @@ from switchmt_snn.tasks.suite import TaskSuite
 COPIES = 4
 """Copies of a task that are recorded side by side; each gives a contiguous stretch."""
 _KEYS = ("observations", "actions", "epsilon", "seed")
-"""Arrays of a file that are read."""
+"""Arrays that every file has."""
 PIECE_STEPS = 64
 """Steps of every copy that are held at once where play is not kept."""
 
@@ -34,6 +34,7 @@ class Recording:
     Attributes:
         observations: raw stacked observations ``[N, *shape]``.
         actions: what was done ``[N]``, as indices of Q-values.
+        rewards: raw reward of each action ``[N]``; None in files of older versions.
         epsilon: share of random actions while it was recorded.
         seed: of the episodes.
 
@@ -43,6 +44,7 @@ class Recording:
     task: str
     observations: npt.NDArray[Any]
     actions: npt.NDArray[np.int64]
+    rewards: npt.NDArray[np.float64] | None
     epsilon: float
     seed: int
 
@@ -77,7 +79,8 @@ def recorded_play(
     path = folder / f"{file_name(task)}-step-{agent.step}.npz"
     if path.exists():
         recording = read_recording(path, task, agent.suite)
-        if len(recording.actions) >= decisions and recording.seed == config.seed:
+        stale = recording.rewards is None or recording.seed != config.seed
+        if len(recording.actions) >= decisions and not stale:
             return _first(recording, decisions)
     recording = play(agent, task, decisions, config.epsilon, config.seed, go_on)
     folder.mkdir(parents=True, exist_ok=True)
@@ -86,6 +89,7 @@ def recorded_play(
             stream,
             observations=recording.observations,
             actions=recording.actions,
+            rewards=np.asarray(recording.rewards, np.float64),
             first_action=np.asarray(agent.suite.first_action(agent.suite.index(task))),
             epsilon=np.asarray(recording.epsilon),
             seed=np.asarray(recording.seed),
@@ -96,11 +100,13 @@ def recorded_play(
 def _first(recording: Recording, decisions: int) -> Recording:
     """The first decisions of every copy: what a recording of that many would have been."""
     steps = -(-decisions // COPIES)
-    observations, actions = (
-        values.reshape(COPIES, -1, *values.shape[1:])[:, :steps].reshape(-1, *values.shape[1:])
-        for values in (recording.observations, recording.actions)
-    )
-    return replace(recording, observations=np.ascontiguousarray(observations), actions=actions)
+
+    def first(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return values.reshape(COPIES, -1, *values.shape[1:])[:, :steps].reshape(-1, *values.shape[1:])
+
+    rewards = None if recording.rewards is None else first(recording.rewards)
+    observations = np.ascontiguousarray(first(recording.observations))
+    return replace(recording, observations=observations, actions=first(recording.actions), rewards=rewards)
 
 
 def read_recording(path: Path, task: str, suite: TaskSuite) -> Recording:
@@ -109,7 +115,7 @@ def read_recording(path: Path, task: str, suite: TaskSuite) -> Recording:
     Raises:
         ExportError: it is none of this task.
     """
-    stored = read_npz(path, _KEYS, "recorded play of this run; delete it")
+    stored = read_npz(path, (*_KEYS, "rewards"), "recorded play of this run; delete it")
     for key in _KEYS:
         if key not in stored:
             raise ExportError(f"recorded play {path} has no {key}, expected {', '.join(_KEYS)}; delete it")
@@ -135,7 +141,13 @@ def read_recording(path: Path, task: str, suite: TaskSuite) -> Recording:
             f"recorded play {path} has epsilon {epsilon.tolist()!r:.40} and seed {seed.tolist()!r:.40}, expected a "
             "probability and a whole number from 0; delete it"
         )
-    return Recording(task, observations, actions.astype(np.int64), float(epsilon), int(seed))
+    rewards = stored.get("rewards")
+    if rewards is not None and (rewards.shape != actions.shape or rewards.dtype.kind != "f"):
+        raise ExportError(
+            f"recorded play {path} has rewards of shape {rewards.shape} and type {rewards.dtype}, expected "
+            f"{actions.shape} of floating-point numbers; delete it"
+        )
+    return Recording(task, observations, actions.astype(np.int64), rewards, float(epsilon), int(seed))
 
 
 def play(
@@ -143,15 +155,15 @@ def play(
 ) -> Recording:
     """Play at least ``decisions`` decisions of a task in ``COPIES`` copies."""
     pieces = list(play_in_pieces(agent, task, decisions, epsilon, seed, go_on))
-    observations, actions = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    observations, actions, rewards = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
     flat = observations.reshape(-1, *agent.suite.observation_shape)
-    return Recording(task, flat, actions.reshape(-1), epsilon, seed)
+    return Recording(task, flat, actions.reshape(-1), rewards.reshape(-1), epsilon, seed)
 
 
 def play_in_pieces(
     agent: Agent, task: str, decisions: int, epsilon: float, seed: int, go_on: Callable[[], None] | None = None
-) -> Iterator[tuple[npt.NDArray[Any], npt.NDArray[np.int64]]]:
-    """``play`` step by step: observations ``[COPIES, n, *shape]`` and actions ``[COPIES, n]``, n a few steps."""
+) -> Iterator[tuple[npt.NDArray[Any], npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+    """``play`` piece by piece: observations ``[COPIES, n, *shape]``, actions and rewards ``[COPIES, n]``."""
     index, suite = agent.suite.index(task), agent.suite
     rng = np.random.default_rng([seed, index])
     valid = np.flatnonzero(suite.valid_actions_KA[index])
@@ -162,7 +174,7 @@ def play_in_pieces(
         while left:
             steps = min(left, PIECE_STEPS)
             observations = np.empty((COPIES, steps, *suite.observation_shape), suite.frame_dtype)
-            actions = np.empty((COPIES, steps), np.int64)
+            actions, rewards = np.empty((COPIES, steps), np.int64), np.empty((COPIES, steps))
             for step in range(steps):
                 if go_on is not None:
                     go_on()
@@ -176,8 +188,8 @@ def play_in_pieces(
                 actions[:, step] = np.where(
                     explore, random_actions, agent.q_values(copies.observations, index).argmax(axis=-1)
                 )
-                copies.step(actions[:, step])
-            yield observations, actions
+                rewards[:, step] = copies.step(actions[:, step]).rewards
+            yield observations, actions, rewards
             left -= steps
     finally:
         copies.close()

@@ -88,7 +88,7 @@ class Energy:
         layers: in forward order: operations, neuron updates and spikes that have a price, and memory traffic where the
             target has a memory model.
         not_included: what was counted and has no price, in words.
-        ann_pj: compute and memory of the ANN twin; None where the target cannot multiply.
+        ann_layers_pj: compute and memory of the ANN twin by layer; None where the target cannot multiply.
         quantised_ann_pj: of the quantised twin: where the ANN's inputs are activations, one addition per activation bit
             and weight, if that is cheaper than a multiplication, and activations of that many bits in memory. None also
             where the network is an ANN, whose activations have no number of bits.
@@ -99,7 +99,7 @@ class Energy:
     layers: tuple[LayerEnergy, ...]
     not_included: tuple[str, ...]
     has_memory: bool
-    ann_pj: float | None
+    ann_layers_pj: tuple[float, ...] | None
     quantised_ann_pj: float | None
 
     @property
@@ -116,6 +116,11 @@ class Energy:
     def total_pj(self) -> float:
         """Compute and, where known, memory."""
         return self.compute_pj + (self.memory_pj or 0.0)
+
+    @property
+    def ann_pj(self) -> float | None:
+        """Compute and memory of the ANN twin."""
+        return None if self.ann_layers_pj is None else sum(self.ann_layers_pj)
 
     @property
     def by_ann(self) -> float | None:
@@ -140,6 +145,7 @@ class Energy:
             "total_pj": self.total_pj,
             "not_included": list(self.not_included),
             "ann_pj": self.ann_pj,
+            "ann_layers_pj": None if self.ann_layers_pj is None else list(self.ann_layers_pj),
             "quantised_ann_pj": self.quantised_ann_pj,
             "by_ann": self.by_ann,
             "by_quantised_ann": self.by_quantised_ann,
@@ -151,35 +157,37 @@ def estimate(task: TaskCounts, target: Target) -> Energy:
     """Energy of a task's mean decision."""
     unpriced: list[str] = []
     layers = tuple(_layer_energy(layer, task.spiking, target, unpriced) for layer in task.layers)
+    quantised = _ann_layers_pj(task, target, quantised=True) if task.spiking else None
     return Energy(
         target=target.name,
         task=task.task,
         layers=layers,
         not_included=tuple(unpriced),
         has_memory=target.memory is not None,
-        ann_pj=_ann_pj(task, target),
-        quantised_ann_pj=_ann_pj(task, target, quantised=True) if task.spiking else None,
+        ann_layers_pj=_ann_layers_pj(task, target),
+        quantised_ann_pj=None if quantised is None else sum(quantised),
     )
 
 
-def _ann_pj(task: TaskCounts, target: Target, quantised: bool = False) -> float | None:
-    """Energy of the ANN of the same shape, or of its twin with activations of few bits."""
+def _ann_layers_pj(task: TaskCounts, target: Target, quantised: bool = False) -> tuple[float, ...] | None:
+    """Energy of each layer of the ANN of the same shape, or of its twin with activations of few bits."""
     mac = target.operations_pj.get("mac")
     if mac is None:
         return None
-    total = 0.0
+    layers = []
     for layer in task.layers:
         # Where numbers come in (the first layer), the quantised twin sees the same numbers.
         few_bits = quantised and layer.operation == "AC"
         bits = task.activation_bits
         price = min(mac, bits * target.operations_pj["ac"]) if few_bits else mac
-        total += layer.macs_of_ann_twin * price
+        layer_pj = layer.macs_of_ann_twin * price
         if target.memory is not None:
             parts = _memory_pj(ann_traffic(layer), layer, target.memory)
             if few_bits:
                 parts["activations"] *= min(1.0, bits / target.memory.state_bits)
-            total += sum(parts.values())
-    return total
+            layer_pj += sum(parts.values())
+        layers.append(layer_pj)
+    return tuple(layers)
 
 
 def _layer_energy(layer: LayerCounts, spiking: bool, target: Target, unpriced: list[str]) -> LayerEnergy:

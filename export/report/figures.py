@@ -1,4 +1,4 @@
-"""The two figures of a profile: energy by target and layer, and spikes by layer and simulation step."""
+"""The figures of a profile: energy by target and layer, spikes by layer and step, and how often neurons fire."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from switchmt_snn.drawing.chart import Chart, Series
 from switchmt_snn.drawing.rows import LogRows, RowSeries, RowValue
+from switchmt_snn.runs.files import file_name
 
 PICOJOULE_PER_MICROJOULE = 1e6
 MOST_STEPS = 8
@@ -79,6 +81,35 @@ def spikes_figure(facts: dict[str, Any]) -> LogRows | None:
         values=tuple(values),
         note=_means(len(tasks)),
     )
+
+
+def rates_figures(facts: dict[str, Any]) -> list[Chart]:
+    """For each task a histogram of every layer's neurons by how often they fire; all have the same axes."""
+    layers = [(task, [layer for layer in task["layers"] if layer["neurons"]]) for task in facts["tasks"]]
+    shares = [[_shares(layer) for layer in of_task] for _, of_task in layers]
+    highest = max((max(share) for of_task in shares for share in of_task), default=0.0)
+    return [
+        Chart(
+            name=f"rates_{file_name(task['task'])}",
+            title=f"{task['task']}: share of a layer's {'neurons' if facts['spiking'] else 'units'}",
+            x_label="spikes per simulation step" if facts["spiking"] else "share of decisions above zero",
+            series=tuple(_steps(layer["name"], share) for layer, share in zip(of_task, of_shares, strict=True)),
+            y_range=(0.0, highest),
+            y_percent=True,
+        )
+        for (task, of_task), of_shares in zip(layers, shares, strict=True)
+    ]
+
+
+def _shares(layer: dict[str, Any]) -> list[float]:
+    return [count / layer["neurons"] for count in layer["rate_histogram"]]
+
+
+def _steps(name: str, shares: list[float]) -> Series:
+    """A histogram from 0 to 1 as a line with steps."""
+    edges = np.linspace(0.0, 1.0, len(shares) + 1)
+    x = np.repeat(edges, 2)[1:-1]
+    return Series(name, tuple(x.tolist()), tuple(np.repeat(shares, 2).tolist()))
 
 
 def _value(row: int, series: int, values: list[float]) -> RowValue:

@@ -12,14 +12,14 @@ import numpy.typing as npt
 from markupsafe import Markup
 from PIL import Image
 
-from switchmt_snn.drawing.chart import WIDE
+from switchmt_snn.drawing.chart import WIDE, Chart, picture_of
 from switchmt_snn.drawing.marks import SERIES_COLOURS, series_colour
-from switchmt_snn.drawing.numbers import digits
+from switchmt_snn.drawing.numbers import digits, scaled
 from switchmt_snn.drawing.page import FILTERS as PAGE_FILTERS
 from switchmt_snn.drawing.page import page_environment
 from switchmt_snn.drawing.rows import LogRows, rows_picture
 from switchmt_snn.drawing.svg import inline_svg
-from switchmt_snn.export.report.figures import energy_figure, spikes_figure
+from switchmt_snn.export.report.figures import energy_figure, rates_figures, spikes_figure
 
 Frames = Sequence[npt.NDArray[Any]]
 """Frames of each task's stretch of play, ``[n, *frame_shape]``."""
@@ -47,6 +47,12 @@ def render_report(runs: list[dict[str, Any]], frames: Sequence[Frames], command:
     environment.filters |= FILTERS
     environment.globals |= FILTERS | {"colours": _LAYER_COLOURS, "raster": _raster, "picture": _picture}
     environment.globals |= {"energy_figure": energy_figure, "spikes_figure": spikes_figure, "drawn": _drawn}
+    environment.globals |= {
+        "rates_figures": rates_figures,
+        "panel": _panel,
+        "chip_rows": chip_rows,
+        "energies": energies,
+    }
     return environment.get_template("report.html.jinja").render(
         runs=list(zip(runs, frames, strict=True)), command=command
     )
@@ -57,17 +63,52 @@ def microjoule(value_pj: float) -> str:
     return digits(value_pj / 1e6)
 
 
-def joule(value_pj: float) -> str:
-    """Picojoule as joule."""
-    return digits(value_pj / 1e12)
+def energy(value_pj: float) -> str:
+    """An energy in the unit that fits, not to be broken between lines."""
+    return scaled(value_pj * 1e-12, "J").replace(" ", "\u00a0")
 
 
-def thousandth(value: float) -> str:
-    """A unit as the next larger one."""
-    return digits(value / 1e3)
+def energies(smallest_pj: float, largest_pj: float) -> str:
+    """A range of energies; a unit that both have is written once."""
+    low, high = energy(smallest_pj), energy(largest_pj)
+    if low == high:
+        return high
+    number, unit = low.split()
+    return f"{number if high.split()[1] == unit else low} to {high}"
 
 
-FILTERS = PAGE_FILTERS | {filter.__name__: filter for filter in (microjoule, joule, thousandth)}
+def power(value_uw: float) -> str:
+    """A power in the unit that fits."""
+    return scaled(value_uw * 1e-6, "W").replace(" ", "\u00a0")
+
+
+FILTERS = PAGE_FILTERS | {filter.__name__: filter for filter in (microjoule, energy, power)}
+
+
+def chip_rows(run: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a decision costs on each chip and whether the chip can hold the network, a row per chip.
+
+    ``cost`` is None where no energy is published, ``fit`` where the chip's limits are not known, ``same_actions`` where
+    the chip's rounded weights were not tried.
+    """
+    costs, fits = run["summary"]["chips"], {chip["title"]: chip for chip in run["chips"]}
+    rows = []
+    for name in dict.fromkeys([*costs, *fits]):
+        fit = fits.get(name)
+        shares = [
+            effect["equal_actions_share"]
+            for task in run["tasks"]
+            for effect in task.get("precision", ())
+            if fit is not None and fit["fits"] and effect["bits"] == fit["weight_bits"]
+        ]
+        same = {"smallest": min(shares), "largest": max(shares)} if shares else None
+        rows.append({"name": name, "cost": costs.get(name), "fit": fit, "same_actions": same})
+    return rows
+
+
+def _panel(chart: Chart) -> Markup:
+    """One of several charts side by side."""
+    return Markup(inline_svg(picture_of(chart)))
 
 
 def _drawn(figure: LogRows) -> Markup:

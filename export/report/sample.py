@@ -41,11 +41,13 @@ class Sample:
     Attributes:
         first_decision: index of its first decision in the recording.
         actions: names of what was done.
+        rewards: raw reward of each action.
         frames: newest frame of each observation ``[n, *frame_shape]``.
     """
 
     first_decision: int
     actions: tuple[str, ...]
+    rewards: tuple[float, ...]
     layers: tuple[LayerSample, ...]
     frames: npt.NDArray[Any]
 
@@ -54,6 +56,7 @@ class Sample:
         return {
             "first_decision": self.first_decision,
             "actions": list(self.actions),
+            "rewards": list(self.rewards),
             "layers": [vars(layer) for layer in self.layers],
         }
 
@@ -70,6 +73,7 @@ def take_sample(agent: Agent, task: int, recording: Recording) -> Sample:
     return Sample(
         first_decision=first,
         actions=tuple(agent.suite.action_names[action] for action in recording.actions[chosen]),
+        rewards=() if recording.rewards is None else tuple(recording.rewards[chosen].tolist()),
         layers=tuple(_layer_sample(name, active_TBN) for name, active_TBN in by_layer.items()),
         frames=observations[:, -channels:],
     )

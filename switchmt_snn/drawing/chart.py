@@ -309,7 +309,8 @@ def _strips(frame: _Frame, chart: Chart) -> list[Mark]:
         middle = frame.x_low + (index + 0.5) * (frame.x_high - frame.x_low) / count
         lines = [line for series in shown for line in _at(series, middle, chart.y_percent)]
         if lines:
-            title = "\n".join([f"near {chart.x_label} {whole(middle)}", *lines])
+            place = whole(middle) if frame.x_high - frame.x_low > STRIPS else digits(middle)
+            title = "\n".join([f"near {chart.x_label} {place}", *lines])
             marks.append(Box(frame.left + index * width, frame.top, width, frame.height, "paper", 0.0, title))
     return marks
 

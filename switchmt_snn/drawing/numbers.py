@@ -41,6 +41,17 @@ def compact(value: float) -> str:
     return f"{value:,.4g}" if abs(value) < 1e3 else f"{value:,.0f}"
 
 
+def scaled(value: float, unit: str) -> str:
+    """Three significant digits in the unit that fits, from pico to the unit itself.
+
+    >>> scaled(0.00783, "J"), scaled(1.47e-6, "J"), scaled(15.6, "J")
+    ('7.83 mJ', '1.47 µJ', '15.6 J')
+    """
+    prefixes = (("", 1.0), ("m", 1e-3), ("µ", 1e-6), ("n", 1e-9), ("p", 1e-12))
+    prefix, factor = next((one for one in prefixes if abs(value) >= 0.9995 * one[1]), prefixes[-1])
+    return f"{digits(value / factor)} {prefix}{unit}"
+
+
 def bytes_of(value: float) -> str:
     """Bytes in the unit that fits.
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich import box
 from rich.table import Table
 
 from switchmt_snn.acting.evaluation import Evaluation, TaskScore
-from switchmt_snn.drawing.numbers import bytes_of, compact, duration
+from switchmt_snn.drawing.numbers import bytes_of, compact, duration, scaled
 from switchmt_snn.machine.memory import GIB
 from switchmt_snn.runs.description import MethodDescription
 from switchmt_snn.runs.listing import RunSummary
@@ -177,14 +177,14 @@ def energy_table(profile: dict[str, Any]) -> Table:
         else "x dense: by the same ANN if no zero saves anything, the task with the most."
     )
     table = _table(
-        "Energy per decision in µJ: compute, and memory where the target has a memory model",
+        "Energy per decision: compute, and memory where the target has a memory model",
         f"{meaning} * something counted has no price there (report.html says what, and what each target leaves out). "
         "How: est(imated), sim(ulated), rep(orted), mea(sured).",
     )
     _add_columns(table, ("target", "how"), (*(task["task"] for task in tasks), *ratios))
     for index, target in enumerate(profile["targets"].values()):
         rows = [task["energy"][index] for task in tasks]
-        cells = [f"{_three_digits(row['total_pj'] / 1e6)}{'*' if row['not_included'] else ''}" for row in rows]
+        cells = [f"{_energy(row['total_pj'])}{'*' if row['not_included'] else ''}" for row in rows]
         for twin in ratios.values():
             known = [row[twin] for row in rows if row[twin] is not None]
             cells.append(f"{max(known):.2f}" if known else "")
@@ -227,22 +227,26 @@ def comparison_table(profiles: list[dict[str, Any]]) -> Table:
     table.add_column("")
     for profile in profiles:
         table.add_column(profile["run"], justify="right")
-    for label, key, unit, kinds in (
-        ("spikes", "spikes", 1.0, (True,)),
-        ("per neuron and step", "rate", 1.0, (True,)),
-        ("active units (ANN)", "spikes", 1.0, (False,)),
-        ("energy (µJ)", "total_pj", 1e6, (True, False)),
-        ("x ANN", "by_ann", 1.0, (True, False)),
-        ("x QANN", "by_quantised_ann", 1.0, (True,)),
+    for label, key, show, kinds in (
+        ("spikes", "spikes", _three_digits, (True,)),
+        ("per neuron and step", "rate", _three_digits, (True,)),
+        ("active units (ANN)", "spikes", _three_digits, (False,)),
+        ("energy", "total_pj", _energy, (True, False)),
+        ("x ANN", "by_ann", _three_digits, (True, False)),
+        ("x QANN", "by_quantised_ann", _three_digits, (True,)),
     ):
         if any(profile["spiking"] in kinds for profile in profiles):
-            cells = (_span(one["summary"][key], unit) if one["spiking"] in kinds else "" for one in profiles)
+            cells = (_span(one["summary"][key], show) if one["spiking"] in kinds else "" for one in profiles)
             table.add_row(label, *cells)
     return table
 
 
-def _span(values: dict[str, float | None], unit: float) -> str:
-    known = [_three_digits(value / unit) for value in values.values() if value is not None]
+def _energy(value_pj: float) -> str:
+    return scaled(value_pj * 1e-12, "J")
+
+
+def _span(values: dict[str, float | None], show: Callable[[float], str]) -> str:
+    known = [show(value) for value in values.values() if value is not None]
     return " to ".join(dict.fromkeys(known))
 
 

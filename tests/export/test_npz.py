@@ -21,6 +21,7 @@ SUITE = vector_suite(lambda task, num_envs: CountingEnvironment(task, num_envs, 
 GOOD: dict[str, Any] = {
     "observations": np.arange(32, dtype=np.float32).reshape(8, 4),
     "actions": np.arange(8) % 3,
+    "rewards": np.arange(8) - 0.5,
     "first_action": np.asarray(0),
     "epsilon": np.asarray(0.05),
     "seed": np.asarray(7),
@@ -36,6 +37,9 @@ def test_a_good_recording_is_read(tmp_path: Path) -> None:
     read = recording.read_recording(saved(tmp_path / "a.npz"), "a", SUITE)
     assert np.array_equal(read.observations, GOOD["observations"])
     assert read.actions.tolist() == GOOD["actions"].tolist()
+    assert read.rewards is not None
+    assert read.rewards.tolist() == GOOD["rewards"].tolist()
+    assert recording.read_recording(saved(tmp_path / "old.npz", rewards=None), "a", SUITE).rewards is None
     assert (read.epsilon, read.seed, read.actions.dtype) == (0.05, 7, np.int64)
     fortran = saved(tmp_path / "f.npz", observations=np.asfortranarray(GOOD["observations"]))
     assert np.array_equal(recording.read_recording(fortran, "a", SUITE).observations, GOOD["observations"])
@@ -53,6 +57,8 @@ def test_a_good_recording_is_read(tmp_path: Path) -> None:
         ({"actions": np.zeros((8, 1), np.int64)}, "actions of shape .8, 1."),
         ({"actions": np.asarray(1)}, "actions of shape .. and type int64"),
         ({"actions": np.zeros(7, np.int64)}, "observations of shape .8, 4. and type float32, and actions of shape .7,"),
+        ({"rewards": np.zeros(7)}, "rewards of shape .7,. and type float64, expected .8,. of floating-point numbers"),
+        ({"rewards": np.zeros(8, np.int64)}, "rewards of shape .8,. and type int64"),
         ({"actions": None}, "has no actions, expected observations, actions, epsilon, seed"),
         ({"observations": np.zeros((8, 5), np.float32)}, "observations of shape .8, 5."),
         ({"observations": np.zeros((8, 4))}, "type float64, and actions"),

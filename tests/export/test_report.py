@@ -19,7 +19,7 @@ from rich.console import Console
 from switchmt_snn import train
 from switchmt_snn.config import from_dict
 from switchmt_snn.export import profile
-from switchmt_snn.export.report.page import FILTERS, render_report
+from switchmt_snn.export.report.page import FILTERS, chip_rows, energies, render_report
 from switchmt_snn.viewing.tables import comparison_table, energy_table, profile_table
 from tests.export.export_cases import RunCommand
 from tests.pages import assert_sound
@@ -52,6 +52,8 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1] == "text":  # of a drawing: the numbers of its axis
             self.axis.append(data)
+        elif self.open and self.open[-1] == "title" and data.startswith("near "):  # a place on the axis, then values
+            self.text += data.splitlines()[1:]
         elif self.open and self.open[-1] != "style":
             self.text.append(data)
 
@@ -76,7 +78,8 @@ def numbers_that_may_stand(facts: Any) -> set[str]:
         if isinstance(leaf, str):
             allowed |= set(NUMBER.findall(leaf))
         elif leaf is not None and not isinstance(leaf, bool):
-            allowed |= {text for show in FILTERS.values() for text in NUMBER.findall(show(leaf))} | {str(leaf)}
+            allowed |= {text for show in FILTERS.values() for text in NUMBER.findall(show(leaf))}
+            allowed |= {str(leaf), f"{leaf:.1%}"}
     prose = re.sub(r"<style>.*?</style>|\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}|<[^>]*>", " ", TEMPLATE.read_text(), flags=re.S)
     return allowed | set(NUMBER.findall(prose))
 
@@ -214,11 +217,64 @@ def test_the_tables_of_an_ann_speak_of_no_spikes(ann_and_spiking: list[dict[str,
     assert cells["active units (ANN)"][0] != "" == cells["active units (ANN)"][1]
 
 
+def test_the_first_screen_says_what_a_decision_costs_where_and_whether_the_chip_holds_it(profiled: Path) -> None:
+    facts = json.loads((profiled / "profile.json").read_text())
+    rows = {row["name"]: row for row in chip_rows(facts)}
+    assert set(rows) == {target["chip"] for target in facts["targets"].values()} | {
+        chip["title"] for chip in facts["chips"]
+    }
+    on_loihi = [
+        energy["total_pj"]
+        for task in facts["tasks"]
+        for energy in task["energy"]
+        if energy["target"].startswith("loihi")
+    ]
+    loihi = rows["Loihi"]
+    assert (loihi["cost"]["smallest"], loihi["cost"]["largest"]) == (min(on_loihi), max(on_loihi))
+    shares = [task["precision"][0]["equal_actions_share"] for task in facts["tasks"]]
+    assert loihi["fit"]["fits"]
+    assert loihi["same_actions"] == {"smallest": min(shares), "largest": max(shares)}
+    assert (rows["Speck 2e/2f"]["cost"], rows["45 nm CMOS"]["fit"]) == (None, None)
+    page = (profiled / "report.html").read_text()
+    beginning = page[: page.index("<section>")]
+    assert f"{energies(min(on_loihi), max(on_loihi))}*</td>" in beginning, "multiplications of conv1 have no price"
+
+
+def test_the_ann_is_drawn_beside_the_spiking_network(profiled: Path) -> None:
+    facts = json.loads((profiled / "profile.json").read_text())
+    page = (profiled / "report.html").read_text()
+    largest = max(
+        energy for task in facts["tasks"] for energy in (task["energy"][0]["total_pj"], task["energy"][0]["ann_pj"])
+    )
+    for task in facts["tasks"]:
+        energy = task["energy"][0]
+        assert sum(energy["ann_layers_pj"]) == pytest.approx(energy["ann_pj"])
+        bar = page[page.index(f"{task['task']}, ANN</span>") :]
+        widths = re.findall(r"width:([\d.]+)%", bar[: bar.index("</div>")])
+        assert [float(width) for width in widths] == pytest.approx(
+            [100 * part / largest for part in energy["ann_layers_pj"]]
+        )
+
+
+def test_actions_and_rewards_stand_under_their_frames(profiled: Path) -> None:
+    facts = json.loads((profiled / "profile.json").read_text())
+    page = (profiled / "report.html").read_text()
+    for task in facts["tasks"]:
+        sample, name = task["sample"], task["task"]
+        with np.load(next((profiled.parent / "recordings").glob(f"{name}-step-*.npz"))) as stored:
+            first = sample["first_decision"]
+            assert sample["rewards"] == stored["rewards"][first : first + len(sample["actions"])].tolist()
+        under = re.findall(rf'alt="a frame of {name}"><span>(.*?)</span><span>(.*?)</span>', page)
+        rewards = map(FILTERS["digits"], sample["rewards"])
+        assert under == list(zip(sample["actions"], rewards, strict=True))
+
+
 def test_figures_show_what_profile_json_says(profiled: Path) -> None:
     facts = json.loads((profiled / "profile.json").read_text())
-    assert [figure["name"] for figure in facts["figures"]] == ["energy", "spikes"]
+    rates = [f"rates_{task['task']}" for task in facts["tasks"]]
+    assert [figure["name"] for figure in facts["figures"]] == ["energy", "spikes", *rates]
     for kind in ("svg", "png", "csv"):
-        assert {path.stem for path in (profiled / "figures").glob(f"*.{kind}")} == {"energy", "spikes"}
+        assert {path.stem for path in (profiled / "figures").glob(f"*.{kind}")} == {"energy", "spikes", *rates}
     with (profiled / "figures" / "energy.csv").open(newline="") as stream:
         rows = {(row["row"], row["series"]): row for row in csv.DictReader(stream)}
     for index, target in enumerate(facts["targets"]):
@@ -230,6 +286,15 @@ def test_figures_show_what_profile_json_says(profiled: Path) -> None:
         names = [layer["name"] for layer in facts["tasks"][0]["layers"]]
         parts = [float(rows[target, name]["value"]) for name in names]
         assert sum(parts) == pytest.approx(float(row["value"]))
+    scales = [figure["y_range"] for figure in facts["figures"] if figure["name"] in rates]
+    assert all(scale == scales[0] for scale in scales), "one scale for all tasks"
+    for task in facts["tasks"]:
+        with (profiled / "figures" / f"rates_{task['task']}.csv").open(newline="") as stream:
+            points = list(csv.DictReader(stream))
+        for layer in (layer for layer in task["layers"] if layer["neurons"]):
+            of_layer = [float(point["y"]) for point in points if point["series"] == layer["name"]]
+            assert of_layer[::2] == of_layer[1::2] == [count / layer["neurons"] for count in layer["rate_histogram"]]
+            assert sum(of_layer[::2]) == pytest.approx(1 - layer["silent"] / layer["neurons"])
     with (profiled / "figures" / "spikes.csv").open(newline="") as stream:
         seen = list(csv.DictReader(stream))
     for layer in (layer for layer in facts["tasks"][0]["layers"] if layer["neurons"]):
