@@ -43,7 +43,7 @@ OURS: dict[str, dict[str, Any]] = {
 }
 
 
-def plain_loop(steps: int) -> Iterator[None]:
+def plain_loop(steps: int, update_every: int = UPDATE_EVERY) -> Iterator[None]:
     """A DQN loop without tricks; yields after every agent step."""
     rng = np.random.default_rng(0)
     env, network = wrapped_game(GAME), PlainLoop(4)
@@ -70,7 +70,7 @@ def plain_loop(steps: int) -> Iterator[None]:
         stacks[0, step], stacks[1, step] = observation, following
         actions[step], rewards[step], terminals[step] = action, float(np.clip(reward, -1.0, 1.0)), terminated
         observation = env.reset()[0] if terminated or truncated else following
-        if step >= WARM_UP and step % UPDATE_EVERY == 0:
+        if step >= WARM_UP and step % update_every == 0:
             update.batch = sample(step)
             update()
         yield

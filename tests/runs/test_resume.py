@@ -146,7 +146,6 @@ def test_killed_at_random_moments_ends_bitwise_the_same(config: Path, whole: Pat
     ("engine", "more"),
     [
         ("compiled", ()),
-        ("native", ()),
         ("native", ("--network.quantiles", "4", "--learning.loss", "huber", "--network.heads", "per_task")),
     ],
 )
