@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from switchmt_snn.cli.parsing import for_named_tasks, parse, split_one
+from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, split_one
 from switchmt_snn.config import ExperimentConfig, load_config
 from switchmt_snn.viewing import output
 
@@ -31,7 +31,11 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.runs.description import describe
     from switchmt_snn.viewing.tables import layers_table, methods_table
 
-    config, source = options.experiment, source or "quickstart"
+    config = options.experiment
+    told = for_another_suite(source, default, config, rest, "describe")
+    if told is not None:
+        output.console(stderr=options.json).print(told, highlight=False, soft_wrap=True)
+    source = source or "quickstart"
     methods = describe(config)
     if options.json:
         facts: dict[str, Any] = {"config": config.name, "source": source, "available_memory_bytes": available_bytes()}

@@ -5,15 +5,17 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import shlex
 from dataclasses import replace
 from typing import Any
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from switchmt_snn.config import ExperimentConfig, presets
+from switchmt_snn.config import ExperimentConfig, load_config, presets
 from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.machine.program import runnable
 
 ARGUMENTS = {
     "train": ("CONFIG", "a YAML file or a preset (default: with --run the config of the run there, else quickstart)"),
@@ -184,6 +186,16 @@ def peek(argv: list[str], flag: str) -> str | None:
     return None
 
 
+def _without(argv: list[str], flag: str) -> list[str]:
+    """The words without a flag and its value."""
+    following = [False, *(word == flag for word in argv)]
+    return [
+        word
+        for word, is_value in zip(argv, following, strict=False)
+        if not (is_value or word.partition("=")[0] == flag)
+    ]
+
+
 def for_named_tasks(config: ExperimentConfig, argv: list[str]) -> ExperimentConfig:
     """A config without its returns by task if flags name other tasks: they would end the training of those.
 
@@ -205,6 +217,30 @@ def for_named_tasks(config: ExperimentConfig, argv: list[str]) -> ExperimentConf
         evaluation=replace(config.evaluation, stop_at_returns=()),
         switching=replace(config.switching, reference_scores=(), floor_scores=()),
     )
+
+
+def for_another_suite(
+    source: str | None, default: ExperimentConfig, config: ExperimentConfig, argv: list[str], command: str
+) -> str | None:
+    """What to say where flags put tasks of another suite into a preset: its settings were chosen for its own.
+
+    Args:
+        source: what is named as CONFIG; None for quickstart.
+        default: the config that flags change.
+        config: with the flags.
+        argv: the flags.
+        command: its name.
+    """
+    source, suite, names = source or "quickstart", config.tasks.suite, config.tasks.names
+    if suite == default.tasks.suite or source not in presets():
+        return None
+    told = f"note: the settings of the preset {source} are for the suite {default.tasks.suite}, not for {suite}; "
+    made_for = [name for name in presets() if load_config(name).tasks.suite == suite]
+    if not made_for:
+        return f"{told}no preset is for that suite, so write a config of your own (docs/configuration.md)"
+    nearest = min(made_for, key=lambda name: abs(len(load_config(name).tasks.names) - len(names)))
+    again = shlex.join(["switchmt-snn", command, nearest, *_without(argv, "--run")])
+    return f"{told}presets for that suite: {', '.join(made_for)}. Try: {runnable(again)}"
 
 
 RENAMED = {"evaluate": {"--engine": "--runtime"}, "export": {"--nir-profile": "--nir-dialect"}}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from switchmt_snn.cli.parsing import for_named_tasks, parse, peek, split_one
+from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.machine.program import program, runnable
@@ -52,6 +52,9 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.viewing.tensorboard import TensorBoard
 
     console = output.console(stderr=options.json)
+    told = for_another_suite(source, default, config, rest, "train")
+    if told is not None:
+        console.print(told, highlight=False, soft_wrap=True)
     observers: list[Observer] = [Progress(console)]
     if config.recording.tensorboard:
         observers.append(TensorBoard())

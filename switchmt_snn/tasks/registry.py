@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 from switchmt_snn.config import SuiteDefaults, TasksConfig
@@ -14,7 +15,8 @@ from switchmt_snn.tasks.gym import GymSuite
 from switchmt_snn.tasks.minatar import MinAtarSuite
 from switchmt_snn.tasks.suite import Suite, TaskSuite
 
-SUITES: dict[str, type[Suite]] = {suite.name: suite for suite in (AtariSuite, MinAtarSuite, GymSuite)}
+_BUILT_IN: tuple[type[Suite], ...] = (AtariSuite, MinAtarSuite, GymSuite)
+SUITES: dict[str, type[Suite]] = {suite.name: suite for suite in _BUILT_IN}
 """By name: the built-in suites, and those that ``register_suite`` added."""
 
 AnySuite = TypeVar("AnySuite", bound=type[Suite])
@@ -80,7 +82,7 @@ def make_suite(config: TasksConfig) -> TaskSuite:
         require_facts(suite, config)
     for name in config.names:
         if name not in known and not suite.open_names:
-            raise TaskError(f"tasks.names has the unknown {suite.name} task {name!r}{did_you_mean(name, known)}")
+            raise TaskError(f"tasks.names has the unknown {suite.name} task {name!r}{_hint(name, known)}")
     if config.minimal_action_mask and not suite.masks_actions:
         raise ConfigError(
             f"tasks.minimal_action_mask is True, expected false for the suite {config.suite!r}, which states no "
@@ -99,6 +101,14 @@ def make_suite(config: TasksConfig) -> TaskSuite:
     with suite_code(type(suite), config.suite, "make"):
         tasks = suite.make()
     return require_tasks(tasks, config)
+
+
+def _hint(name: str, known: Sequence[str]) -> str:
+    """The suite that has a task of that name, or near names."""
+    for suite in _BUILT_IN:
+        if name in suite.known_tasks() or (suite is GymSuite and ":" in name):
+            return f", expected one of that suite; tasks.suite={suite.name} has it"
+    return did_you_mean(name, known)
 
 
 def _require_complete(suite: object) -> None:

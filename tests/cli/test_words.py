@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, TaskS
 from switchmt_snn.cli import main
 from switchmt_snn.cli.evaluate import EvaluateOptions
 from switchmt_snn.cli.export import ExportOptions
-from switchmt_snn.cli.parsing import split, split_one
+from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, split, split_one
 from switchmt_snn.cli.train import TrainOptions
 from switchmt_snn.config import ExperimentConfig, from_dict, load_config, presets
 from switchmt_snn.config.numbers import whole_number
@@ -212,3 +214,41 @@ def test_what_environments_print_is_not_mixed_with_json(
     assert code == 0
     assert json.loads(out)[0]["task"] == "tests.tasks.odd_envs:Plain-v0"
     assert "hello" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "presets_named", "command"),
+    [
+        ("--tasks.suite gym --tasks.names CartPole-v1", "cartpole, classic", "train cartpole {}"),
+        ("quickstart --tasks.suite=gym --tasks.names A-v0 B-v0 --seed 2", "cartpole, classic", "train classic {}"),
+        ("classic --tasks.names asterix --tasks.suite minatar", "minatar", "train minatar {}"),
+        ("cartpole --tasks.suite atari --tasks.names pong", "quickstart, fast, paper, pong", "train pong {}"),
+    ],
+)
+def test_tasks_of_another_suite_than_the_presets_are_told_its_presets(
+    words: str, presets_named: str, command: str
+) -> None:
+    """Its remedy, when followed, has nothing more to say; a run's folder, which exists by then, is left out."""
+    said, flags = suite_note([*words.split(), "--run", "runs/x"])
+    assert said is not None
+    assert f"; presets for that suite: {presets_named}" in said
+    again = shlex.split(said.partition(" Try: ")[2])
+    assert again == ["switchmt-snn", *command.format(" ".join(flags[:-2])).split()]
+    assert suite_note(again[2:])[0] is None
+
+
+def test_a_suite_without_a_preset_and_a_config_of_ones_own() -> None:
+    default = load_config("quickstart")
+    config = replace(default, tasks=replace(default.tasks, suite="tests.tasks.test_suites:Counting", names=("a",)))
+    said = for_another_suite(None, default, config, [], "train")
+    assert said is not None
+    assert said.endswith("no preset is for that suite, so write a config of your own (docs/configuration.md)")
+    assert for_another_suite("my.yaml", default, config, [], "train") is None
+
+
+def suite_note(words: list[str]) -> tuple[str | None, list[str]]:
+    """What train says about suites, and the flags."""
+    source, flags = split_one(TrainOptions, words, "train", TRAIN)
+    default = for_named_tasks(load_config(source or "quickstart"), flags)
+    config = parse(TrainOptions, flags, "train", TrainOptions(experiment=default)).experiment
+    return for_another_suite(source, default, config, flags, "train"), flags

@@ -168,6 +168,9 @@ def test_minatar_channels_are_padded() -> None:
     ("config", "message"),
     [
         (TasksConfig(names=("pongg",)), "unknown atari task 'pongg'; did you mean 'pong'"),
+        (TasksConfig(names=("CartPole-v1",)), r"expected one of that suite; tasks\.suite=gym has it"),
+        (TasksConfig(names=("asterix", "my_envs:Left-v0")), r"'my_envs:Left-v0', .*; tasks\.suite=gym has it"),
+        (TasksConfig(suite="minatar", names=("pong",)), r"tasks\.suite=atari has it"),
         (TasksConfig(suite="minatar", names=("brekout",)), "did you mean 'breakout'"),
         (TasksConfig(suite="gym", names=("CartPole-v9",)), "unknown Gymnasium id 'CartPole-v9'"),
         (TasksConfig(suite="gym", names=("Nothing-v0",)), "unknown Gymnasium id"),
