@@ -47,6 +47,7 @@ class MemoryEstimate:
         network_bytes: networks, gradients, optimizer.
         switching_bytes: parameter vectors that the criterion keeps.
         activations_bytes: what an update holds at once.
+        checkpoint_bytes: what writing a checkpoint holds at once.
     """
 
     process_bytes: int
@@ -54,12 +55,13 @@ class MemoryEstimate:
     network_bytes: int
     switching_bytes: int
     activations_bytes: int
+    checkpoint_bytes: int
 
     @property
     def total_bytes(self) -> int:
         """All parts."""
-        parts = self.replay_bytes + self.network_bytes + self.switching_bytes + self.activations_bytes
-        return parts + self.process_bytes
+        networks = self.network_bytes + self.switching_bytes + self.checkpoint_bytes
+        return self.process_bytes + self.replay_bytes + networks + self.activations_bytes
 
 
 def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwork, neurons: int) -> MemoryEstimate:
@@ -84,6 +86,7 @@ def estimate_memory(config: ExperimentConfig, suite: TaskSuite, network: QNetwor
         network_bytes=5 * parameters,  # weights, gradients, two Adam moments, target network
         switching_bytes=snapshots * parameters,
         activations_bytes=activations,
+        checkpoint_bytes=2 * (4 + snapshots) * parameters,  # weights, target, moments: each as bytes, then in one file
     )
 
 
@@ -181,7 +184,8 @@ def require_memory(
     raise ConfigError(
         f"the run needs {(available - room + reserved) / GIB:.1f} GiB (replay {reserved / GIB:.1f}, activations "
         f"{estimate.activations_bytes / GIB:.1f}, networks and snapshots "
-        f"{(estimate.network_bytes + estimate.switching_bytes) / GIB:.1f}, the process itself "
+        f"{(estimate.network_bytes + estimate.switching_bytes) / GIB:.1f}, writing a checkpoint "
+        f"{estimate.checkpoint_bytes / GIB:.1f}, the process itself "
         f"{estimate.process_bytes / GIB:.1f}), expected at most the {available / GIB:.1f} GiB that are available; "
         f"{remedy}"
     )

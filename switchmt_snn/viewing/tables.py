@@ -285,7 +285,7 @@ def layers_table(method: MethodDescription) -> Table:
     parts = (
         f"memory: replay {memory.replay_bytes / GIB:.2f} GiB, networks and optimiser {memory.network_bytes / GIB:.2f}, "
         f"snapshots {memory.switching_bytes / GIB:.2f}, activations {memory.activations_bytes / GIB:.2f}, "
-        f"the process itself {memory.process_bytes / GIB:.2f}"
+        f"writing a checkpoint {memory.checkpoint_bytes / GIB:.2f}, the process itself {memory.process_bytes / GIB:.2f}"
     )
     if method.deployed_parameters != method.trainable_parameters:
         trained, deployed = method.trainable_parameters, method.deployed_parameters
