@@ -47,17 +47,15 @@ def command(argv: list[str]) -> int:
         print(to_yaml(config, options.experiment), end="")
         return 0
     from switchmt_snn.runs.run import Observer, train
+    from switchmt_snn.viewing.dashboards import chosen_dashboards
     from switchmt_snn.viewing.progress import Progress
     from switchmt_snn.viewing.tables import evaluation_table
-    from switchmt_snn.viewing.tensorboard import TensorBoard
 
     console = output.console(stderr=options.json)
     told = for_another_suite(source, default, config, rest, "train")
     if told is not None:
         console.print(told, highlight=False, soft_wrap=True)
-    observers: list[Observer] = [Progress(console)]
-    if config.recording.tensorboard:
-        observers.append(TensorBoard())
+    observers: list[Observer] = [Progress(console), *chosen_dashboards(config.recording)]
     result = train(options.experiment, options.run, observers)
     if result.status == "served":
         return 0

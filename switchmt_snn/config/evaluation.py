@@ -57,6 +57,8 @@ class RecordingConfig:
     """Agent steps between two rows of metrics.jsonl."""
     tensorboard: bool = False
     """Also write TensorBoard files (extra: tensorboard)."""
+    trackio: bool = False
+    """Also write to trackio, a dashboard on this machine (extra: trackio)."""
 
     def __post_init__(self) -> None:
         check_fields(self, "recording")
