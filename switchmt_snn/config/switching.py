@@ -20,6 +20,8 @@ Policy = Literal[
     "deficit",
     "learning_progress",
     "plateau_and_return",
+    "harmonic_gain",
+    "dormancy_guard",
 ]
 POLICIES: tuple[str, ...] = get_args(Policy)
 
@@ -30,16 +32,16 @@ class SwitchingConfig:
 
     policy: Literal["auto"] | Policy | PluginName = "auto"
     """fixed_episodes, fixed_steps, interleave, parameter_change (Eq. 3), parameter_change_per_update, reward_plateau,
-    parameter_and_reward, value_change, deficit, learning_progress, plateau_and_return, or a class from outside the
-    package, package.module:Class (docs/extending.md). auto: the method's own (SwitchMT: parameter_change, all others:
-    fixed_episodes)."""
+    parameter_and_reward, value_change, deficit, learning_progress, plateau_and_return, harmonic_gain, dormancy_guard,
+    or a class from outside the package, package.module:Class (docs/extending.md). auto: the method's own (SwitchMT:
+    parameter_change, all others: fixed_episodes)."""
     options: tuple[str, ...] = ()
     """policy=package.module:Class: keyword arguments of the class, each as name=value. The other policies have none."""
     visit_episodes: int = 25
     """fixed_episodes: episodes per visit."""
     visit_steps: int = 10_000
-    """fixed_steps: leave at the first episode end after this many steps. deficit, learning_progress: choose a task anew
-    at the first episode end after this many."""
+    """fixed_steps, dormancy_guard: leave at the first episode end after this many steps. deficit, learning_progress,
+    harmonic_gain: choose a task anew at the first episode end after this many."""
     window_episodes: int = 5
     """K of Eq. 3: the change of parameters or, for value_change, of Q-values is measured across this many episodes."""
     change_threshold: float = 0.10
@@ -48,22 +50,26 @@ class SwitchingConfig:
     """parameter_change_per_update, value_change: leave when the change per update is below this fraction of the visit's
     largest."""
     probe_observations: int = 64
-    """value_change: observations of the task's replay, drawn anew for each visit, whose Q-values are compared."""
+    """value_change, dormancy_guard: observations of the task's replay, drawn anew for each visit, whose Q-values are
+    compared, or at which a neuron fires or is silent."""
+    silent_rise: float = 0.1
+    """dormancy_guard: leave when the share of a layer's neurons that are silent rose by more than this in the visit."""
     reference_scores: tuple[float, ...] = ()
-    """deficit, learning_progress: a raw score for each task, in order; deficit takes one that reaches it as learned.
-    Empty: the suite's published scores of people, which deficit needs then; learning_progress takes the range of each
-    task's own returns where there is none."""
+    """deficit, learning_progress, harmonic_gain: a raw score for each task, in order; deficit and harmonic_gain take a
+    task that reaches it as learned. Empty: the suite's published scores of people, which these two need then;
+    learning_progress takes the range of each task's own returns where there is none."""
     floor_scores: tuple[float, ...] = ()
-    """deficit, learning_progress: what random play scores in each task, in order. Empty: the suite's published scores,
-    or 0."""
+    """deficit, learning_progress, harmonic_gain: what random play scores in each task, in order. Empty: the suite's
+    published scores, or 0."""
     score_episodes: int = 20
-    """deficit: a task's score is the mean return of this many of its newest episodes."""
+    """deficit, harmonic_gain: a task's score is the mean return of this many of its newest episodes."""
     deficit_temperature: float = 0.2
     """deficit: a task's share of the steps is proportional to exp(deficit / temperature)."""
     progress_window_steps: int = 40_000
-    """learning_progress: the slope of the returns is measured across this many of a task's own newest steps."""
+    """learning_progress, harmonic_gain: the slope of the returns is measured across this many of a task's own newest
+    steps."""
     uniform_share: float = 0.2
-    """deficit, learning_progress: this share of the steps is divided equally among all tasks."""
+    """deficit, learning_progress, harmonic_gain: this share of the steps is divided equally among all tasks."""
     check_every_steps: int = 50_000
     """plateau_and_return: play a task that was left on a plateau again after so many steps of the run."""
     check_episodes: int = 5
@@ -104,6 +110,7 @@ class SwitchingConfig:
         require(self.change_threshold > 0, "switching.change_threshold", self.change_threshold, "above 0")
         f = self.change_rate_fraction
         require(0 < f < 1, "switching.change_rate_fraction", f, "within (0, 1)")
+        require(0 < self.silent_rise < 1, "switching.silent_rise", self.silent_rise, "within (0, 1)")
         t = self.deficit_temperature
         require(t > 0, "switching.deficit_temperature", t, "above 0")
         require(0 <= self.uniform_share <= 1, "switching.uniform_share", self.uniform_share, "within [0, 1]")

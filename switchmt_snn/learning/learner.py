@@ -301,8 +301,13 @@ class Learner(Stateful):
         self.network.eval()
         with torch.inference_mode():
             generator = torch.Generator(self.device).manual_seed(0)
-            self.network(self._tensor(observations), task, activity=activity, generator=generator)
+            self.network(self._tensor(observations).to(self.device), task, activity=activity, generator=generator)
         return {name: spikes.mean(dim=(0, 1)).flatten() for name, spikes in activity.items()}
+
+    def silent_shares(self, observations: npt.NDArray[np.generic] | Tensor, task: int) -> dict[str, float]:
+        """Share of each layer's neurons that fire at none of these observations; see ``firing_rates``."""
+        rates = self.firing_rates(observations, task)
+        return {name: float((rate == 0).float().mean()) for name, rate in rates.items()}
 
     def q_values(self, observations: npt.NDArray[np.generic] | Tensor, task: int) -> Tensor:
         """Q-values ``[B, A]`` of the network that learns, for the task's valid actions, in eval mode; on the CPU.

@@ -237,6 +237,7 @@ class Training(Stateful):
                 parameters=self.learner.parameters,
                 observations=partial(self._observations, task),
                 values=partial(self.learner.q_values, task=task),
+                silent_shares=partial(self.learner.silent_shares, task=task),
             )
             decision = self.policy.judge(record, left=switch is not None)
             yield self._decided(decision)

@@ -168,6 +168,8 @@ def test_every_policy_trains_on_atari_and_logs_its_numbers(policy: str, tmp_path
         "deficit": ["score", "deficit", "share", "owed_steps", "most_owed_steps"],
         "learning_progress": ["progress", "median_return", "share", "owed_steps"],
         "plateau_and_return": ["reward_slope", "reward_t", "flat_episodes"],
+        "harmonic_gain": ["score", "progress", "share", "owed_steps"],
+        "dormancy_guard": ["silent_share", "silent_rise", "silent_rise_bound", "visit_steps"],
     }
     assert any(all(row[column] for column in numbers[policy]) for row in rows), rows
 

@@ -156,6 +156,73 @@ def test_without_references_progress_is_relative_to_the_range_seen() -> None:
     assert criterion.progress(0) == pytest.approx(5.0 / (10.0 - criterion.lowest[0]), rel=0.05)
 
 
+def gain_policy(**settings: object) -> SwitchingPolicy:
+    base = {"visit_steps": 100, "progress_window_steps": 400, "uniform_share": 0.0, "reference_scores": (10.0,) * 3}
+    return SwitchingPolicy(SwitchingConfig(policy="harmonic_gain", **(base | settings)), 3)  # type: ignore[arg-type]
+
+
+def test_harmonic_gain_follows_what_a_step_adds_to_the_harmonic_mean() -> None:
+    """Compared with the mean's own differences, at scores of 0.2 and 0.5 of the references and different slopes."""
+    criterion = gain_policy(score_episodes=2).criterion
+    criterion.returns = [[9.0, 1.0, 3.0], [5.0], [4.0, 4.0]]
+    criterion.progresses = [0.1, 0.4, 0.0]
+    scores, small = np.array([0.2, 0.5, 0.4]), 1e-6
+    assert [criterion.score(task) for task in range(3)] == pytest.approx(list(scores))
+
+    def mean_after(steps: np.ndarray) -> float:
+        return float(3 / (1 / (scores + steps * criterion.progresses)).sum())
+
+    gains = [(mean_after(small * np.eye(3)[task]) - mean_after(np.zeros(3))) / small for task in range(3)]
+    assert criterion.wanted() == pytest.approx(np.array(gains) / sum(gains), rel=1e-4)
+    assert criterion.wanted()[2] == 0.0, "it does not move"
+    criterion.returns[0] = [10.0, 12.0]
+    assert criterion.wanted() == pytest.approx([0.0, 1.0, 0.0]), "it has reached its reference"
+    criterion.returns[1] = [11.0]
+    assert criterion.wanted() == pytest.approx([1 / 3] * 3), "nothing to gain: equal steps"
+
+
+def test_harmonic_gain_plays_the_task_that_can_be_learned() -> None:
+    """One task has reached its reference, one rises slowly, one stays at random play: most steps go to the second."""
+    policy = gain_policy(uniform_share=0.3)
+    played = Played(policy, [10, 10, 10], [lambda _: 10.0, lambda n: min(n / 4000, 9.0), lambda _: 0.0]).run(3_000)
+    assert played.shares() == pytest.approx([0.1, 0.8, 0.1], abs=0.02)
+    reasons = {reason for _, reason in played.left}
+    assert reasons == {"harmonic_gain"}
+
+
+def test_harmonic_gain_without_references_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"policy is harmonic_gain, .* expected switching.reference_scores, 3 numbers"
+    ):
+        gain_policy(reference_scores=())
+
+
+def test_the_guard_leaves_a_task_on_which_a_layers_neurons_fell_silent() -> None:
+    policy = SwitchingPolicy(SwitchingConfig(policy="dormancy_guard", visit_steps=100, silent_rise=0.2), 2)
+    asked: list[int] = []
+
+    def judged(steps: int, silent: dict[str, float], updates: int = 1) -> Stay | SwitchTo:
+        made = replace(
+            record(0, steps // 10, steps, 0.0),
+            updates_in_visit=updates,
+            observations=lambda count: asked.append(count) or torch.zeros(count, 4),
+            silent_shares=lambda seen: silent,
+        )
+        return policy.end_of_episode(made)
+
+    assert judged(10, {}, updates=0).measured == {"visit_steps": 100.0}, "nothing was learned yet"
+    shares = [{"conv": 0.5, "value": 0.6}, {"conv": 0.4, "value": 0.6}, {"conv": 0.55, "value": 0.7}]
+    assert all(isinstance(judged(20 + 10 * at, each), Stay) for at, each in enumerate(shares))
+    decision = judged(50, {"conv": 0.61, "value": 0.6})
+    assert isinstance(decision, SwitchTo)
+    assert decision.reason == "neurons_fell_silent"
+    assert decision.measured["silent_share"] == 0.61
+    assert decision.measured["silent_rise"] == pytest.approx(0.21), "from the smallest share of the visit"
+    assert asked == [64], "one probe for the visit"
+    assert isinstance(judged(90, {"conv": 0.9}), Stay), "another visit"
+    assert judged(100, {"conv": 0.9}).reason == "visit_steps"
+
+
 def resting_policy(**settings: object) -> SwitchingPolicy:
     base = {
         "plateau_window_episodes": 4,
@@ -277,6 +344,8 @@ def test_the_values_of_a_training_are_its_networks_and_looking_changes_nothing()
             expected = learner.network.eval()(seen, asked.task)
         valid = suite.valid_actions_KA[asked.task]
         assert torch.equal(values, expected[:, valid])
+        for layer, rates in learner.firing_rates(seen, asked.task).items():
+            assert asked.silent_shares(seen)[layer] == pytest.approx(int((rates == 0).sum()) / len(rates))
         return Stay("looked", {})
 
     trainings[0].policy.judge = judge  # type: ignore[method-assign]

@@ -42,7 +42,8 @@ def record(
     """A record of a visit that began at update 0; default: one update per episode."""
     updates = episode if updates is None else updates
     observations, values = (lambda count: torch.zeros(count, 4)), (lambda seen: theta.mean().expand(len(seen), 2))
-    return EpisodeRecord(task, episode, steps, updates, updates, value, theta.clone, observations, values)
+    seen = (observations, values, lambda seen: {"value": float((theta > 0.5).float().mean())})
+    return EpisodeRecord(task, episode, steps, updates, updates, value, theta.clone, *seen)
 
 
 REFERENCES = [Reference(random=0.0, human=1.0, source="made up")] * 3

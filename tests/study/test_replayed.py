@@ -226,6 +226,7 @@ def test_what_the_logs_cannot_answer_is_refused_by_name(tmp_path: Path) -> None:
         "parameter_change_per_update",
         "parameter_and_reward",
         "value_change",
+        "dormancy_guard",
     }
     with pytest.raises(ConfigError, match=r"value_change cannot be replayed .* has no value_change .* fixed_episodes"):
         replay_policies(RunFolder(run), ["value_change"])

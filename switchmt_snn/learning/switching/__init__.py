@@ -17,6 +17,8 @@ value_change                   change of Q per gradient step fell to a fraction 
 deficit                        a task farther from its reference is owed steps     deficit.py
 learning_progress              a task whose returns change faster is owed steps    learning_progress.py
 plateau_and_return             the returns no longer rise; back when they fell     plateau_and_return.py
+harmonic_gain                  a step elsewhere is expected to add more            harmonic_gain.py
+dormancy_guard                 a number of steps passed, or neurons fell silent    dormancy_guard.py
 =============================  ==================================================  =================================
 
 A class from outside the package is named ``package.module:Class`` (docs/extending.md, Switching policy).
@@ -24,8 +26,10 @@ A class from outside the package is named ``package.module:Class`` (docs/extendi
 
 from switchmt_snn.learning.switching import (
     deficit,
+    dormancy_guard,
     fixed_episodes,
     fixed_steps,
+    harmonic_gain,
     interleave,
     learning_progress,
     parameter_and_reward,
@@ -63,8 +67,10 @@ __all__ = [
     "check_policy",
     "criterion_class",
     "deficit",
+    "dormancy_guard",
     "fixed_episodes",
     "fixed_steps",
+    "harmonic_gain",
     "interleave",
     "learning_progress",
     "make_criterion",

@@ -44,6 +44,7 @@ def check_policy(config: SwitchingConfig) -> None:
                 parameters=theta.clone,
                 observations=lambda count: torch.zeros(count, 4),
                 values=partial(_values, float(theta[0])),
+                silent_shares=partial(_silent_shares, float(theta[0])),
             )
             policy.end_of_episode(record)
             policy.state_dict()
@@ -54,3 +55,7 @@ def check_policy(config: SwitchingConfig) -> None:
 
 def _values(value: float, observations: Tensor) -> Tensor:
     return torch.full((len(observations), 2), value)
+
+
+def _silent_shares(share: float, observations: Tensor) -> dict[str, float]:
+    return {"value": share}

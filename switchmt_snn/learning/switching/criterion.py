@@ -34,7 +34,7 @@ DECISION_COLUMNS = (
 """The columns of switches.csv that every run has; a criterion's own columns follow."""
 
 
-def _no_network(asked: object) -> Tensor:
+def _no_network(asked: object) -> Any:
     raise ConfigError(
         "this episode's record has no network to ask for observations or values, expected one of a training; a "
         "criterion that needs them cannot judge recorded episodes"
@@ -58,6 +58,8 @@ class EpisodeRecord:
             ask ``values`` about. The same step gives the same draw; training's random numbers stay as they are.
         values: takes observations, and returns their Q-values ``[count, A]`` for the task's actions, by the network
             that learns, in eval mode.
+        silent_shares: takes observations, and returns by layer the share of neurons, within [0, 1], that fire at none
+            of them (ANN: whose output is 0), in the network that learns, in eval mode.
         recorded: when a finished run is replayed (``switchmt-snn replay-policies``), the numbers that its switches.csv
             holds for this episode's end, and no network; None in a training.
     """
@@ -71,6 +73,7 @@ class EpisodeRecord:
     parameters: Callable[[], Tensor]
     observations: Callable[[int], Tensor] = _no_network
     values: Callable[[Tensor], Tensor] = _no_network
+    silent_shares: Callable[[Tensor], dict[str, float]] = _no_network
     recorded: Mapping[str, float] | None = None
 
     def recorded_number(self, column: str) -> float:

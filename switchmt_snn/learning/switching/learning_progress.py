@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from switchmt_snn.config import SwitchingConfig
@@ -25,7 +27,7 @@ class LearningProgress(Criterion):
     (teacher-student curriculum, arXiv 1707.00183), Portelas et al. 2019 (20 % uniform, arXiv 1910.07224).
     """
 
-    columns = ("progress", "median_return", *COLUMNS)
+    columns: ClassVar[tuple[str, ...]] = ("progress", "median_return", *COLUMNS)
     deciding = (DECIDING,)
     judges_learning = False
     SAVED = ("steps", "returns", "lowest", "highest", "progresses", "shares")
