@@ -44,6 +44,10 @@ PACKAGES = {
     "popgym": "popgym",
     "memory_gym": "memory-gym",
     "highway_env": "highway-env",
+    "tetris_gymnasium": "tetris-gymnasium",
+    "mo_gymnasium": "mo-gymnasium",
+    "miniworld": "miniworld",
+    "crafter": "crafter",
 }
 """Distributions of modules."""
 BOX2D = ("LunarLander", "BipedalWalker", "CarRacing")
@@ -103,7 +107,8 @@ def named_wrapper(name: str, result: dict[str, Any]) -> str | None:
 
 def versions(names: list[str]) -> dict[str, str]:
     """Of the packages that the environments come from."""
-    packages = {"gymnasium"} | {PACKAGES[module] for name in names if (module := name.partition(":")[0]) in PACKAGES}
+    modules = {name.partition(":")[0].partition(".")[0] for name in names}
+    packages = {"gymnasium"} | {PACKAGES[module] for module in modules if module in PACKAGES}
     if any(name.startswith(BOX2D) for name in names):
         packages.add("box2d")
     return {package: importlib.metadata.version(package) for package in sorted(packages)}

@@ -75,6 +75,8 @@ def _lines(report: EnvironmentReport) -> list[str]:
         "channels_first": "images, channels first: frames of {0} channels, {1} x {2}",
         "grey": "grey images: frames of {0} channel, {1} x {2}",
     }
+    from switchmt_snn.tasks.gym_spaces import in_short
+
     low, high = report.observed
     count = len(report.episode_lengths)
     ended = f"{count} ended in {report.steps:,} steps of random play"
@@ -90,7 +92,7 @@ def _lines(report: EnvironmentReport) -> list[str]:
     yes = {True: "yes", False: "no"}
     threads = "several threads at a time" if report.played_in_threads else "one thread"
     rows = {
-        "space": report.observes,
+        "space": None if report.observes is None else in_short(report.observes),
         "taken for": kinds[report.layout].format(*report.frame_shape)
         + f", {report.frame_dtype}, times {report.scale:g}",
         "observed": f"values from {low:g} to {high:g}",

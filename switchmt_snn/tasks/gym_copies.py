@@ -73,7 +73,7 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         """Step; the environment's info is left out."""
         with self._generators or _NOTHING:
             observation, reward, ended, cut, _ = self.env.step(int(action) + self._first_action)
-        number = self._one_number("reward", reward)
+        number = self._one_number(reward)
         terminated, truncated = self._truth("terminated", ended), self._truth("truncated", cut)
         return self._frame(observation), number, terminated, truncated, {}
 
@@ -123,10 +123,14 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
             placed[tuple(slice(0, side) for side in frame.shape)] = frame
         return placed
 
-    def _one_number(self, name: str, value: Any) -> float:
-        if isinstance(value, (float, int)) or (np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"):
-            return float(value)
-        raise TaskError(f"task {self._name!r} gave {name} = {shown(value)}, expected one number")
+    def _one_number(self, reward: Any) -> float:
+        if isinstance(reward, (float, int)) or (np.ndim(reward) == 0 and np.asarray(reward).dtype.kind in "biuf"):
+            return float(reward)
+        raise TaskError(
+            f"task {self._name!r} gave reward = {shown(reward)}, expected one number; make it one in a wrapper "
+            "(tasks.wrappers=[module:Name]): one of the environment's package, such as "
+            "mo_gymnasium.wrappers:LinearReward, or a gymnasium.RewardWrapper of your own"
+        )
 
     def _truth(self, name: str, value: Any) -> bool:
         if isinstance(value, (bool, np.bool_)) or (np.ndim(value) == 0 and value in (0, 1)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pkgutil
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -167,9 +168,8 @@ def _import(name: str, module: str) -> None:
     except ImportError as error:
         missing = getattr(error, "name", None)
         itself = missing is not None and f"{module}.".startswith(f"{missing}.")
-        remedy = (
-            "install it, or add its folder to PYTHONPATH" if itself else "mend the module, or install what it needs"
-        )
+        needs = "mend the module, or give it what it needs (a package, a display)"
+        remedy = "install it, or add its folder to PYTHONPATH" if itself else needs
         raise TaskError(
             f"tasks.names has {name!r}, expected an importable module before the colon, but importing {module!r} fails "
             f"({error}); {remedy}"
@@ -202,4 +202,12 @@ def _hint(name: str) -> str:
         did_you_mean(name, own)
         if own
         else f"; {module!r} registers none of its classes; call gymnasium.register(id, MyEnv, max_episode_steps=...)"
+        f"{_inner_modules(module)}"
     )
+
+
+def _inner_modules(package: str) -> str:
+    """Modules of a package that may register what the package itself does not."""
+    places = getattr(sys.modules.get(package), "__path__", ())
+    inner = [f"{package}.{found.name}" for found in pkgutil.iter_modules(places) if "env" in found.name]
+    return f", or name the module that does, such as {inner[0]}" if inner else ""

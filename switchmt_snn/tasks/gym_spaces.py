@@ -66,22 +66,22 @@ def frame_layout(
     """
     flatten = with_wrapper(wrappers, "FlattenObservation")
     if not isinstance(space, gymnasium.spaces.Box):
-        raise TaskError(f"task {name!r} observes {_short(space)}, expected a Box; {_remedy(space, flatten)}")
+        raise TaskError(f"task {name!r} observes {in_short(space)}, expected a Box; {_remedy(space, flatten)}")
     shape = tuple(int(side) for side in space.shape)
     if not (1 <= len(shape) <= 3 and all(shape)):
         raise TaskError(
-            f"task {name!r} observes {_short(space)}, expected a vector or an image (one to three dimensions, none "
+            f"task {name!r} observes {in_short(space)}, expected a vector or an image (one to three dimensions, none "
             f"empty); {flatten}"
         )
     kind = np.dtype(space.dtype).kind if space.dtype is not None else "f"
     if len(shape) == 1:
         if kind not in "biuf":
-            raise TaskError(f"task {name!r} observes {_short(space)}, expected numbers")
+            raise TaskError(f"task {name!r} observes {in_short(space)}, expected numbers")
         return FrameLayout("vector", shape, 1.0)
     if not (space.dtype == np.uint8 or kind == "b"):
         raise TaskError(
-            f"task {name!r} observes {_short(space)}, expected uint8 or bool: {len(shape)} dimensions are taken for an "
-            f"image; if they are none, {flatten}; if they are, wrap the environment to return uint8"
+            f"task {name!r} observes {in_short(space)}, expected uint8 or bool: {len(shape)} dimensions are taken for "
+            f"an image; if they are none, {flatten}; if they are, wrap the environment to return uint8"
         )
     scale = 1.0 if kind == "b" else 1.0 / 255.0
     if len(shape) == 2:
@@ -134,7 +134,7 @@ def num_actions(name: str, space: gymnasium.Space[Any], wrappers: Sequence[str] 
     if isinstance(space, (gymnasium.spaces.MultiDiscrete, gymnasium.spaces.MultiBinary)):
         remedy = f"{with_wrapper(wrappers, 'FlattenAction')}, which makes one action of every combination"
     raise TaskError(
-        f"task {name!r} has the action space {_short(space)}, expected Discrete: a Q-network lists actions; {remedy}"
+        f"task {name!r} has the action space {in_short(space)}, expected Discrete: a Q-network lists actions; {remedy}"
     )
 
 
@@ -151,7 +151,7 @@ def _remedy(space: gymnasium.Space[Any], flatten: str) -> str:
     )
 
 
-def _short(space: gymnasium.Space[Any]) -> str:
-    """A space in one short line."""
+def in_short(space: object) -> str:
+    """A space, or its text, in one short line."""
     text = " ".join(str(space).split())
     return text if len(text) <= 120 else f"{text[:117]}..."

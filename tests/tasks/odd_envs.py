@@ -92,6 +92,13 @@ class ListReward(Plain):
         return later(0.0, [1.0], self)
 
 
+class TwoRewards(Plain):
+    """Two aims, as mo-gymnasium gives them."""
+
+    def reward(self, action: Any) -> Any:
+        return later(0.0, np.asarray([0.0, -1.0]), self)
+
+
 class Raises(Plain):
     def reward(self, action: Any) -> Any:
         return later(0, 1, self) and 1 / 0
@@ -342,6 +349,13 @@ class Large(Plain):
 
     def observe(self) -> Any:
         return np.full(4, 100.0 * self.steps, np.float32)
+
+
+class ManyBounds(Plain):
+    observation_space = Box(np.zeros(300, np.float32), np.arange(1, 301, dtype=np.float32))
+
+    def observe(self) -> Any:
+        return np.zeros(300, np.float32)
 
 
 class FaintImage(Plain):

@@ -55,6 +55,7 @@ def rewards(suite: TaskSuite, steps: int = 20, num_envs: int = 1) -> list[list[f
         ("HugeReward", r"gave the rewards \[-1e\+39\], expected finite numbers"),
         ("TextReward", "gave reward = '1', expected one number"),
         ("ListReward", r"gave reward = \[1\.0\], expected one number"),
+        ("TwoRewards", r"gave reward = array\(\[ 0., -1.\]\), expected one number; make it one in a wrapper"),
         ("WideByte", "gave an observation of type int64, expected uint8"),
         ("Raises", r"fails in step \(ZeroDivisionError: division by zero at odd_envs.py, line \d+\)"),
     ],

@@ -128,6 +128,16 @@ def test_the_command_says_that_the_limit_ended_the_play(capsys: pytest.CaptureFi
     assert err.splitlines()[0] == f"{MODULE}:Plain-v0: random play of 1,000 steps, for 5e-10 s at the most"
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_the_command_shortens_a_long_space(capsys: pytest.CaptureFixture[str]) -> None:
+    """A flattened dict has a bound for every number."""
+    with pytest.raises(SystemExit):
+        main(["check-env", f"{MODULE}:ManyBounds-v0", "--steps", "30", "--seconds", "0.1"])
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  space")]
+    assert line.endswith("...")
+    assert len(line) == len("  space      ") + 120
+
+
 @pytest.mark.slow
 def test_drawing_from_global_generators_is_seen_and_does_not_keep_play_from_repeating() -> None:
     report = report_of("GlobalRandom")
