@@ -58,7 +58,7 @@ def command(words: list[str], folder: str) -> dict[str, Any]:
     """Run a command: its exit code, and the last line that it wrote where it did not end with 0."""
     paths = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(EXAMPLES))))
     env = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-    env |= {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}
+    env |= {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYGLET_HEADLESS": "true"}
     whole = [sys.executable, "-m", "switchmt_snn", *words]
     try:
         done = subprocess.run(whole, capture_output=True, text=True, timeout=LONGEST_S, env=env, cwd=folder)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import pkgutil
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -207,7 +207,10 @@ def _hint(name: str) -> str:
 
 
 def _inner_modules(package: str) -> str:
-    """Modules of a package that may register what the package itself does not."""
-    places = getattr(sys.modules.get(package), "__path__", ())
-    inner = [f"{package}.{found.name}" for found in pkgutil.iter_modules(places) if "env" in found.name]
-    return f", or name the module that does, such as {inner[0]}" if inner else ""
+    """A module of a package that registers what the package itself does not, by its text."""
+    for place in getattr(sys.modules.get(package), "__path__", ()):
+        for file in (*Path(place).glob("*/__init__.py"), *Path(place).glob("*.py")):
+            inner = file.parent.name if file.name == "__init__.py" else file.stem
+            if inner != Path(place).name and "register(" in file.read_text("utf-8", errors="ignore"):
+                return f", or name a module that does: it seems that {package}.{inner} does"
+    return ""

@@ -395,5 +395,5 @@ def test_a_gymnasium_environment_is_compared_with_its_declaration(environment, m
 def test_a_module_that_registers_nothing_is_told_to() -> None:
     with pytest.raises(TaskError, match="registers none of its classes"):
         make_suite(TasksConfig(suite="gym", names=("tests.conftest:Still-v0",)))
-    with pytest.raises(TaskError, match=r"or name the module that does, such as tests\.tasks\.odd_envs$"):
+    with pytest.raises(TaskError, match=r"or name a module that does: it seems that tests\.tasks\.\w+ does$"):
         make_suite(TasksConfig(suite="gym", names=("tests.tasks:Nothing-v0",)))
