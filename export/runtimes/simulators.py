@@ -37,6 +37,7 @@ class Simulator:
         dialects: that it reads (``switchmt_snn.export.formats.nir_writer``).
         run: ``(graph, inputs_TB, dt) -> outputs_TB``.
         interpreter: the matching options of ``NirInterpreter``, beside the reset of the graph's metadata.
+        one_tau: whether it computes something else, without a word, where the neurons of a layer have several tau.
     """
 
     modules: tuple[str, ...]
@@ -45,6 +46,7 @@ class Simulator:
     dialects: tuple[str, ...]
     run: Callable[[nir.NIRGraph, Float, float], Float]
     interpreter: dict[str, Any] = field(default_factory=dict)
+    one_tau: bool = False
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -164,7 +166,7 @@ SIMULATORS: dict[str, Simulator] = {
         {"fires_at_threshold": True},
     ),
     "snntorch": Simulator(
-        ("snntorch", "nirtorch"), f"reset to zero, {_ABOVE}", (nir.LIF,), ("spikingjelly",), _snntorch
+        ("snntorch", "nirtorch"), f"reset to zero, {_ABOVE}", (nir.LIF,), ("spikingjelly",), _snntorch, one_tau=True
     ),
 }
 """Simulators that are known to run a network exactly, up to their conventions."""
@@ -185,6 +187,9 @@ def skipped(name: str, graph: nir.NIRGraph) -> str | None:
     others = sorted({type(node).__name__ for node in graph.nodes.values() if not isinstance(node, known)})
     if others:
         return f"refuses {', '.join(others)}, or computes something else"
+    leaky = [node for node in graph.nodes.values() if isinstance(node, nir.LIF)]
+    if simulator.one_tau and any(np.unique(node.tau).size > 1 for node in leaky):
+        return "scales every threshold of a layer by one tau, and this network has several in a layer (learned beta)"
     return None
 
 

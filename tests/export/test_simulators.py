@@ -12,6 +12,7 @@ import nir
 import numpy as np
 import onnx
 import pytest
+import torch
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.errors import ExportError
@@ -23,6 +24,7 @@ from switchmt_snn.export.parity.dyadic import dyadic_copy, dyadic_observations
 from switchmt_snn.export.runtimes.agents import encode, onnx_session, read_nir
 from switchmt_snn.export.runtimes.nir_interpreter import NirInterpreter
 from switchmt_snn.export.runtimes.simulators import SIMULATORS, quietly, simulate, skipped
+from switchmt_snn.spiking.neurons.leaky import LeakyLayer
 from tests.export.export_cases import make_agent, observations
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "deploy.md"
@@ -165,6 +167,27 @@ def test_a_simulator_that_is_not_compared_says_why() -> None:
     assert reasons.get("sinabs", "refuses LIF").startswith("refuses LIF")
     loops = nir_graph(fold_agent(make_agent(reset="subtract")), 0, "exact")
     assert {name for name in SIMULATORS if skipped(name, loops) is None} <= {"nirtorch"}
+
+
+def test_neurons_of_one_layer_with_several_tau_are_not_for_the_importer_that_takes_one() -> None:
+    """Value and advantage stream are one layer of a file; learned, each has a beta of its own. norse runs that."""
+    agent = make_agent(neuron="LIF", learn_beta=True)
+    betas = [module.leaky.beta for module in agent.network.modules() if isinstance(module, LeakyLayer)]
+    with torch.no_grad():
+        for beta, value in zip(betas, (0.2, 0.85, 0.6), strict=True):
+            beta.fill_(value)
+    graph = nir_graph(fold_agent(agent), 1, "spikingjelly")
+    x = encode(agent.suite, agent.config, observations(agent, 12), 0)
+    expected, _ = NirInterpreter(graph).run(x)
+    assert np.allclose(expected.mean(0), trace_torch(agent, observations(agent, 12), 1, 0).q_BA, atol=1e-5)
+    if not SIMULATORS["snntorch"].missing:
+        assert str(skipped("snntorch", graph)).startswith("scales every threshold of a layer by one tau")
+        with quietly():
+            assert not np.allclose(simulate("snntorch", graph, x), expected, atol=0.01)
+    portable = nir_graph(fold_agent(agent), 1)
+    if skipped("norse", portable) is None:
+        with quietly():
+            assert np.allclose(simulate("norse", portable, x), expected, atol=1e-5)
 
 
 def test_conventions_differ_where_they_are_said_to() -> None:
