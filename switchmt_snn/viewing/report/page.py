@@ -137,7 +137,8 @@ def _rendered(template: str, facts: dict[str, Any], drawn: dict[str, list[Chart 
     environment = page_environment("switchmt_snn.viewing.report")
     environment.filters |= {"duration": duration, "compact": compact}
     environment.globals |= {"picture": _picture, "colour": series_colour, "beyond": _beyond}
-    return environment.get_template(template).render(facts=facts, drawn=drawn)
+    folded = [one.name for one in drawn.get("layers", ()) if one.name.startswith("saturated")]
+    return environment.get_template(template).render(facts=facts, drawn=drawn, folded=folded)
 
 
 def _picture(figure: Chart | Timeline) -> Markup:
