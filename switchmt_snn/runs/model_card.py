@@ -54,7 +54,7 @@ def model_card(
             *_training(config, step, history, environment),
             *_score_lines(config, scores),
             *_parity_lines(parity),
-            *_energy_lines(profile),
+            *_energy_lines(profile, METHOD_TRAITS[config.network.method].spiking),
             *_limits(config, scores, profile, parity),
             *_hash_lines(run, step, environment, files or {}),
         ]
@@ -166,10 +166,11 @@ def _profile(run: RunFolder, step: int) -> dict[str, Any] | None:
     return facts if facts.get("training_step") == step else None
 
 
-def _energy_lines(profile: Mapping[str, Any] | None) -> list[str]:
+def _energy_lines(profile: Mapping[str, Any] | None, spiking: bool) -> list[str]:
     lines = ["## Energy", ""]
     if profile is None:
-        return [*lines, "Not profiled at this step; `switchmt-snn profile` counts spikes and estimates energy.", ""]
+        counted = "spikes" if spiking else "operations"
+        return [*lines, f"Not profiled at this step; `switchmt-snn profile` counts {counted} and estimates energy.", ""]
     lines += [
         f"Estimates from exact counts on recorded play ({profile['tool']}), not measurements of a chip. "
         f"{profile['headline']}",

@@ -10,6 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from switchmt_snn.config import METHOD_TRAITS
 from switchmt_snn.drawing.numbers import duration
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.switching import SwitchTo
@@ -48,9 +49,11 @@ class Progress:
         network, suite = config.network, suite_of(config.tasks)
         frames = f" ({config.total_steps * suite.frame_skip:,} emulator frames)" if suite.frames_per_s else ""
         where = f"continuing {folder.path} at step {resumed_at:,}" if resumed_at is not None else f"run {folder.path}"
+        spiking = METHOD_TRAITS[network.method].spiking
+        steps = f"T={network.timesteps}, {network.encoding} encoding, " if spiking else ""
         self.console.print(
-            f"{where}: {network.method} on {', '.join(training.suite.names)}, T={network.timesteps}, "
-            f"{network.encoding} encoding, switching {config.switching.policy}, "
+            f"{where}: {network.method} on {', '.join(training.suite.names)}, {steps}"
+            f"switching {config.switching.policy}, "
             f"{config.total_steps:,} agent steps{frames}, "
             f"{training.learner.device}",
             highlight=False,

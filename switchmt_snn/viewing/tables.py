@@ -119,11 +119,13 @@ def runs_table(runs: Sequence[RunSummary]) -> Table:
 
 def parity_table(parity: dict[str, Any]) -> Table:
     """What ``export`` compared: exact numbers, recorded play, other simulators (the content of parity.json)."""
+    spiking = any(row["flipped_spikes"] for row in parity["dyadic"] + parity["recorded"])
+    flipping = ", where rounding near a threshold may flip a spike; flips: decisions with at least one"
+    bitwise = "every spike and every Q-value" if spiking else "every Q-value"
     table = _table(
         "Parity with the trained network",
-        "exact: a copy whose sums do not round. play: real weights on recorded play, where rounding near a threshold "
-        "may flip a spike; flips: decisions with at least one, actions: share of equal ones, |dQ|: largest difference. "
-        "bitwise: every spike and every Q-value.",
+        f"exact: a copy whose sums do not round. play: real weights on recorded play{flipping if spiking else ''}; "
+        f"actions: share of equal ones, |dQ|: largest difference. bitwise: {bitwise}.",
     )
     _add_columns(table, ("check", "task", "runtime"), ("n", "flips", "|dQ|", "actions", "bitwise"))
     for check, rows in (("exact", parity["dyadic"]), ("play", parity["recorded"])):

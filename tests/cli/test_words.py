@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -25,7 +26,7 @@ from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.machine import program as names
 from switchmt_snn.viewing.output import FILE_COLUMNS, console
-from switchmt_snn.viewing.tables import evaluation_table
+from switchmt_snn.viewing.tables import evaluation_table, parity_table
 from tests.tasks.odd_envs import Plain
 
 TRAIN = TrainOptions(experiment=ExperimentConfig())
@@ -252,3 +253,22 @@ def suite_note(words: list[str]) -> tuple[str | None, list[str]]:
     default = for_named_tasks(load_config(source or "quickstart"), flags)
     config = parse(TrainOptions, flags, "train", TrainOptions(experiment=default)).experiment
     return for_another_suite(source, default, config, flags, "train"), flags
+
+
+@pytest.mark.parametrize("spiking", [False, True])
+def test_a_table_of_parity_speaks_of_spikes_where_there_are_some(spiking: bool) -> None:
+    row: dict[str, Any] = {
+        "task": "pong",
+        "runtime": "onnx",
+        "decisions": 32,
+        "equal_actions_share": 1.0,
+        "decisions_with_flips": 0,
+        "flipped_spikes": {"conv1": 0} if spiking else {},
+        "largest_q_difference": 0.0,
+        "bitwise": True,
+    }
+    stream = io.StringIO()
+    Console(file=stream, width=200).print(parity_table({"dyadic": [row], "recorded": [row], "simulators": []}))
+    text = stream.getvalue()
+    assert ("spike" in text) == ("flips:" in text) == spiking
+    assert "every Q-value" in text

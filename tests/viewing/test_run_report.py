@@ -251,3 +251,11 @@ def test_every_training_ends_with_its_page(tmp_path: Path, capsys: pytest.Captur
     _, facts = written(run / "report.html")
     assert (facts["status"], facts["steps"]) == ("finished", 400)
     assert facts["peak_memory_bytes"]["process"] > 50 * 1024**2
+
+
+def test_the_page_of_an_ann_has_no_simulation_steps(tmp_path: Path) -> None:
+    page, facts = written(write_report([DQN], tmp_path))
+    assert facts["timesteps"] is facts["encoding"] is None
+    text = " ".join(page.text).partition("Settings")[0]
+    assert "DQN on breakout; switching" in text
+    assert not re.search(r"spike|T=|encoding", text)

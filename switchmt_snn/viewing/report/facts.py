@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.acting.evaluation import EvaluationProtocol
-from switchmt_snn.config import to_dict
+from switchmt_snn.config import METHOD_TRAITS, to_dict
 from switchmt_snn.drawing.chart import Chart, Timeline
 from switchmt_snn.drawing.numbers import duration
 from switchmt_snn.runs.listing import RETURN_WINDOW_EPISODES, folder_bytes
@@ -52,13 +52,14 @@ def run_facts(run: Sources, figures: dict[str, list[Chart | Timeline]], out: Pat
         out: folder of the page, from which its links go.
     """
     verdicts = [_verdict(run, task) for task in run.tasks]
+    spiking = METHOD_TRAITS[run.config.network.method].spiking
     return {
         "format": FORMAT,
         "run": run.folder.path.resolve().name,
         "headline": _headline(run, verdicts),
         **{key: value for key, value in run.summary.to_dict().items() if key not in ("path", "scores")},
-        "timesteps": run.config.network.timesteps,
-        "encoding": run.config.network.encoding,
+        "timesteps": run.config.network.timesteps if spiking else None,
+        "encoding": run.config.network.encoding if spiking else None,
         "policy": run.config.switching.policy,
         "updates": run.history.updates,
         "environment": {
