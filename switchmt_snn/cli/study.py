@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from switchmt_snn.cli.parsing import parse, split_one
 from switchmt_snn.errors import ConfigError, SwitchMTError
@@ -15,6 +15,7 @@ from switchmt_snn.viewing import output
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from switchmt_snn.study.engine import Engine
     from switchmt_snn.study.folder import StudyFolder
     from switchmt_snn.study.grid import Study
 
@@ -27,6 +28,13 @@ class StudyOptions:
     """Folder of the study: continued if it holds the same study. Default: runs/studies/NAME."""
     jobs: int | None = None
     """Trials at the same time. Default: as many as there are cores; never more."""
+    engine: Literal["local", "ray"] = "local"
+    """Where trials train. local: processes on this machine; ray: the nodes of a Ray cluster (extra: ray), which all see
+    the study's folder (docs/studies.md)."""
+    address: str = "auto"
+    """--engine ray: HOST:PORT of the cluster; auto: the one that this machine is a node of."""
+    gpus_per_trial: float = 0.0
+    """--engine ray: the part of a GPU that each trial gets, such as 0.25."""
     seeds: tuple[int, ...] = ()
     """Seeds in place of those of the file."""
     set: tuple[str, ...] = ()
@@ -67,6 +75,10 @@ def command(argv: list[str]) -> int:
         raise ConfigError("study got several of --dry-run, --status and --report, expected one of them")
     if options.status:
         return _status(console, study, folder, options.json)
+    if options.engine != "ray":
+        for name, value in (("--address", options.address != "auto"), ("--gpus-per-trial", options.gpus_per_trial)):
+            if value:
+                raise ConfigError(f"study got {name} with --engine local, expected it with --engine ray only")
     if options.dry_run:
         return _dry_run(console, study, folder, options)
     if options.report:
@@ -124,10 +136,11 @@ def _report(console: Console, study: Study, folder: StudyFolder, as_json: bool) 
 
 def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOptions) -> int:
     from switchmt_snn.runs.signals import stop_requests
-    from switchmt_snn.study.local import jobs_for, run_trials
+    from switchmt_snn.study.engine import run_trials
     from switchmt_snn.study.watching import Screen
 
-    jobs = jobs_for(study.trials, options.jobs)
+    engine = _engine(options)
+    jobs = engine.jobs(study.trials, options.jobs)
     lock = folder.lock()
     try:
         folder.prepare(study)
@@ -141,13 +154,25 @@ def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOpti
         )
         screen = Screen(console, study, folder, jobs, finished)
         with stop_requests() as requested:
-            failed = run_trials(waiting, folder, jobs, screen, requested)
+            failed = run_trials(waiting, folder, jobs, engine, screen, requested)
             stopped = requested()
         _report(console, study, folder, options.json)
     finally:
         lock.release()
     _say_how_to_go_on(console, folder, stopped, [trial.name for trial in failed])
     return 130 if stopped else 1 if failed else 0
+
+
+def _engine(options: StudyOptions) -> Engine:
+    if options.engine == "local":
+        from switchmt_snn.study.local import LocalEngine
+
+        return LocalEngine()
+    if options.engine == "ray":
+        from switchmt_snn.study.ray_cluster import RayEngine
+
+        return RayEngine(options.address, options.gpus_per_trial)
+    raise ConfigError(f"--engine is {options.engine!r}, expected local or ray")
 
 
 def _say_how_to_go_on(console: Console, folder: StudyFolder, stopped: bool, failed: list[str]) -> None:

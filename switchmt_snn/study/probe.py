@@ -23,9 +23,9 @@ from switchmt_snn.config import ExperimentConfig, SwitchingConfig, to_dict, to_y
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.runs.listing import folder_bytes
 from switchmt_snn.runs.plan import plan
+from switchmt_snn.study.engine import command_of, environment_of, last_words
 from switchmt_snn.study.folder import TrialRun
 from switchmt_snn.study.grid import Trial
-from switchmt_snn.study.local import command_of, environment_of, last_words
 
 MEASURED_S = 20.0
 """Seconds of learning that are measured."""
@@ -168,7 +168,7 @@ class _Process:
                 stdin=subprocess.DEVNULL,
                 stdout=stream,
                 stderr=subprocess.STDOUT,
-                env=environment_of(config),
+                env=environment_of(config.threads or 1),
                 start_new_session=True,
             )
 

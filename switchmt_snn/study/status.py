@@ -10,9 +10,10 @@ from rich.text import Text
 
 from switchmt_snn.drawing.numbers import bytes_of, duration
 from switchmt_snn.runs.listing import folder_bytes
+from switchmt_snn.study.engine import last_words
 from switchmt_snn.study.folder import StudyFolder
 from switchmt_snn.study.grid import Study
-from switchmt_snn.study.local import free_cores, last_words
+from switchmt_snn.study.local import free_cores
 from switchmt_snn.study.timing import Clock
 
 STATUSES = ("finished", "running", "stopped", "waiting", "failed")

@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from switchmt_snn.drawing.numbers import duration
+from switchmt_snn.study.engine import last_words
 from switchmt_snn.study.folder import Attempt, StudyFolder, TrialRun
 from switchmt_snn.study.grid import Study, Trial
-from switchmt_snn.study.local import last_words
 from switchmt_snn.study.timing import Clock
 
 EVERY_S = 30.0
 
 
 class Screen:
-    """Plain lines; see ``switchmt_snn.study.local.Watcher``."""
+    """Plain lines; see ``switchmt_snn.study.engine.Watcher``."""
 
     def __init__(self, console: Console, study: Study, folder: StudyFolder, jobs: int, finished: int) -> None:
         self.console, self.study, self.folder, self.jobs = console, study, folder, jobs
