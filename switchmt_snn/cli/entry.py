@@ -14,14 +14,14 @@ usage: switchmt-snn COMMAND [options]
 
   train [CONFIG]      train (CONFIG: a YAML file or a preset; default: quickstart), or continue the run of --run DIR
   evaluate [RUN]      play a run's agent and the random policy under a stated protocol (default: newest run)
-  play [RUN]          film a run's agent beside its spikes, Q-values and gains (default: newest run)
-  export [RUN]        write the network as ONNX and NIR files, and prove that they decide alike (default: newest run)
+  play [RUN]          record a video of a run's agent beside its spikes, Q-values and gains (default: newest run)
+  export [RUN]        write ONNX and NIR files with a model card, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
-  report [RUN ...]    one HTML page: curves, switches, speed, layers, scores; of several runs a comparison
+  report [RUN ...]    plot curves, switches, layers and scores on one HTML page; compare several runs
   study CONFIG        many runs: variants, grids and seeds from one YAML file, each a plain run; resumable
   replay-policies [RUN]  at which episode end each policy would have left the visits of a run (default: newest run)
-  runs [FOLDER]       the run folders with method, tasks, steps, status, scores and size (default: runs/)
-  pack [RUN]          a run without its replay, to give away: config, logs, evaluations, weights (default: newest run)
+  runs [FOLDER]       list the run folders: method, tasks, steps, status, scores and size (default: runs/)
+  pack [RUN]          a run to give away: weights, model card, config, logs, no replay (default: newest run)
   describe [CONFIG]   layers, parameters, operations and memory of the seven methods, before anything runs
   check-env ID ...    what an environment is taken for, how it plays, and why training would refuse it
   doctor              versions, games and devices of this installation

@@ -16,7 +16,7 @@ from switchmt_snn.viewing import output
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """Film a run's agent: the game beside spikes, Q-values and gains; every number also goes to a CSV and a JSON."""
+    """Record a video of a run's agent: the game beside spikes, Q-values and gains; every number as CSV and JSON."""
 
     task: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Which task; may be repeated, for tasks side by side. Default: the run's first."""

@@ -35,8 +35,10 @@ def command(argv: list[str]) -> int:
     options = parse(ReplayOptions, rest, "replay-policies", ReplayOptions())
     from switchmt_snn.runs.packing import open_run
     from switchmt_snn.study.replayed import csv_text, replay_policies, replay_table
+    from switchmt_snn.viewing.progress_bar import ProgressBars
 
-    replayed = replay_policies(open_run(name), options.policy, options.set)
+    with ProgressBars():
+        replayed = replay_policies(open_run(name), options.policy, options.set)
     if options.out is not None:
         try:
             write_atomically(options.out, csv_text(replayed).encode())

@@ -11,7 +11,7 @@ from switchmt_snn.viewing import output
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Write one HTML page about a run (curves, switches, speed, layers, scores), or about several side by side."""
+    """Plot a run on one HTML page (curves, switches, speed, layers, scores), or compare several."""
 
     out: Path | None = None
     """Folder to write to. Default: the run's own; with several runs the first one's."""
@@ -26,12 +26,14 @@ def command(argv: list[str]) -> int:
     names, rest = split(ReportOptions, argv, "report", ReportOptions())
     options = parse(ReportOptions, rest, "report", ReportOptions())
     from switchmt_snn.runs.packing import open_run
+    from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.report.page import write_report
 
     chosen: list[str | None] = [*names] or [None]  # None is the newest run
     found = [open_run(name).path for name in chosen]
     runs = [open_run(path, to_write=True).path for path in found]
-    page = write_report(runs, options.out, options.figures)
+    with ProgressBars():
+        page = write_report(runs, options.out, options.figures)
     if options.json:
         output.print_json(page.with_suffix(".json").read_text("utf-8"))
     else:

@@ -12,7 +12,7 @@ from switchmt_snn.viewing import output
 
 @dataclass(frozen=True)
 class RunsOptions:
-    """The run folders in a folder: method, tasks, steps, status, newest scores, time and size."""
+    """List the run folders in a folder: method, tasks, steps, status, newest scores, time and size."""
 
     json: bool = False
     """Print them as JSON."""

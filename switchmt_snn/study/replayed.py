@@ -29,6 +29,7 @@ from switchmt_snn.learning.switching import (
     SwitchTo,
     criterion_class,
 )
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.history import policy_columns, read_history
 from switchmt_snn.study.grid import override_settings, with_settings
@@ -140,16 +141,19 @@ def replay_policies(run: RunFolder, policies: Sequence[str] = (), overrides: Seq
     own = config.switching.policy
     rows: list[Replayed] = []
     refused: dict[str, str] = {}
-    for name in dict.fromkeys(policies or (own, *POLICIES)):
-        try:
-            options = settings.options if name == own or is_plugin(name) else ()
-            asked = replace(settings, policy=PluginName(name), options=options)  # any name; the config checks it
-            _require_columns(asked, config.switching, columns)
-            rows += _replay(asked, visits, config, references)
-        except ConfigError as error:
-            if policies:
-                raise ConfigError(f"{name} cannot be replayed on {run.path}: {error}") from error
-            refused[name] = str(error)
+    names = tuple(dict.fromkeys(policies or (own, *POLICIES)))
+    with progress_of(f"replaying {len(visits):,} visits", len(names), "policies") as progress:
+        for name in names:
+            try:
+                options = settings.options if name == own or is_plugin(name) else ()
+                asked = replace(settings, policy=PluginName(name), options=options)  # any name; the config checks it
+                _require_columns(asked, config.switching, columns)
+                rows += _replay(asked, visits, config, references)
+            except ConfigError as error:
+                if policies:
+                    raise ConfigError(f"{name} cannot be replayed on {run.path}: {error}") from error
+                refused[name] = str(error)
+            progress.advance()
     return Replay(str(run.path), own, tuple(rows), refused)
 
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import io
 import threading
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from switchmt_snn.machine.progress import Work, listening, progress_of
+from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.study.replayed import replay_policies
 from switchmt_snn.viewing.progress_bar import FIRST_LINE_S, LINES_EVERY_S, ProgressBars
+from switchmt_snn.viewing.report.page import write_report
+
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 
 
 class Clock:
@@ -106,3 +112,26 @@ def test_a_failure_ends_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ZeroDivisionError
     with progress_of("counting", 2, "decisions") as work:  # nobody listens any more
         assert work.listener is None
+
+
+def test_reports_and_replayed_policies_tell_how_far_they_are(tmp_path: Path) -> None:
+    ended: list[tuple[str, int, int]] = []
+
+    class Heard:
+        def begun(self, work: Work) -> None:
+            assert work.done == 0
+
+        def advanced(self, work: Work) -> None:
+            assert work.done <= work.total
+
+        def ended(self, work: Work) -> None:
+            ended.append((work.what, work.done, work.total))
+
+    with listening(Heard()):
+        page = write_report([RUNS / "gym", RUNS / "minatar"], tmp_path, figures=True)
+        replay_policies(RunFolder(RUNS / "gym"), ("fixed_episodes", "fixed_steps"))
+    figures = len(list((tmp_path / "comparison_figures").glob("*.csv")))
+    assert page.is_file()
+    assert [(done, total) for _, done, total in ended] == [(2, 2), (figures, figures), (2, 2)]
+    assert ended[0][0] == "reading logs"
+    assert ended[1][0] == "drawing"

@@ -16,6 +16,7 @@ from switchmt_snn.drawing.numbers import compact, digits, duration
 from switchmt_snn.drawing.page import page_environment
 from switchmt_snn.drawing.svg import inline_svg
 from switchmt_snn.errors import RunFolderError
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.files import json_text, write_atomically
 from switchmt_snn.viewing.report.comparison import (
     Group,
@@ -50,7 +51,11 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None, figu
     """
     paths = list(dict.fromkeys(Path(run) for run in runs))
     folder = Path(out) if out is not None else paths[0]
-    read = [read_sources(path) for path in paths]
+    read = []
+    with progress_of("reading logs", len(paths), "runs") as progress:
+        for path in paths:
+            read.append(read_sources(path))
+            progress.advance()
     charts: list[Chart | Timeline]
     if len(read) == 1:
         sections = figures_of(read[0])
@@ -129,8 +134,11 @@ def _write(
 
 def _write_figures(folder: Path, charts: Sequence[Chart | Timeline]) -> None:
     folder.mkdir(exist_ok=True)
-    for name, content in figure_files(charts).items():
-        write_atomically(folder / name, content)
+    with progress_of("drawing", len(charts), "figures") as progress:
+        for chart in charts:
+            for name, content in figure_files([chart]).items():
+                write_atomically(folder / name, content)
+            progress.advance()
 
 
 def _rendered(template: str, facts: dict[str, Any], drawn: dict[str, list[Chart | Timeline]]) -> str:
