@@ -126,11 +126,13 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
     def _one_number(self, reward: Any) -> float:
         if isinstance(reward, (float, int)) or (np.ndim(reward) == 0 and np.asarray(reward).dtype.kind in "biuf"):
             return float(reward)
-        raise TaskError(
-            f"task {self._name!r} gave reward = {shown(reward)}, expected one number; make it one in a wrapper "
-            "(tasks.wrappers=[module:Name]): one of the environment's package, such as "
-            "mo_gymnasium.wrappers:LinearReward, or a gymnasium.RewardWrapper of your own"
-        )
+        remedy = "mend the environment's reward"
+        if np.ndim(reward) > 0:
+            remedy = (
+                "make it one in a wrapper (tasks.wrappers=[module:Name]): one of the environment's package, such as "
+                "mo_gymnasium.wrappers:LinearReward, or a gymnasium.RewardWrapper of your own"
+            )
+        raise TaskError(f"task {self._name!r} gave reward = {shown(reward)}, expected one number; {remedy}")
 
     def _truth(self, name: str, value: Any) -> bool:
         if isinstance(value, (bool, np.bool_)) or (np.ndim(value) == 0 and value in (0, 1)):

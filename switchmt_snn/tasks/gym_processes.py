@@ -10,7 +10,7 @@ import contextlib
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -45,9 +45,18 @@ class GymProcesses:
         if context == "forkserver":
             multiprocessing.set_forkserver_preload([__name__])
         with self._answers():
-            self._vector = AsyncVectorEnv(
-                [partial(_here, name, make)] * num_envs, context=context, autoreset_mode=AutoresetMode.DISABLED
-            )
+            if context == "forkserver":
+                _start_server()
+            others = multiprocessing.active_children()
+            try:
+                self._vector = AsyncVectorEnv(
+                    [partial(_here, name, make)] * num_envs, context=context, autoreset_mode=AutoresetMode.DISABLED
+                )
+            except BaseException:  # Ctrl-C: a process that starts would miss what is freed now, with a traceback
+                for process in set(multiprocessing.active_children()) - set(others):
+                    process.kill()
+                    process.join()
+                raise
 
     def reset(self, env_ids: npt.NDArray[np.int64], seeds: npt.NDArray[np.int64]) -> Frames:
         """Start new episodes with the given seeds."""
@@ -91,6 +100,24 @@ class GymProcesses:
             ) from error
         finally:
             gymnasium.logger.min_level = level
+
+
+@cache
+def _start_server() -> None:
+    """Wait for the server's imports, which take seconds: Ctrl-C must not meet a copy that is not yet a process.
+
+    Raises:
+        EOFError: it cannot start a process.
+    """
+    process = multiprocessing.get_context("forkserver").Process(target=_nothing, daemon=True)
+    process.start()
+    process.join()
+    if process.exitcode != 0:
+        raise EOFError
+
+
+def _nothing() -> None:
+    """What the server's first process does."""
 
 
 class _Reporting(gymnasium.Wrapper[Any, int, Any, int]):

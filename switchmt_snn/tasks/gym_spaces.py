@@ -69,9 +69,10 @@ def frame_layout(
         raise TaskError(f"task {name!r} observes {in_short(space)}, expected a Box; {_remedy(space, flatten)}")
     shape = tuple(int(side) for side in space.shape)
     if not (1 <= len(shape) <= 3 and all(shape)):
+        remedy = flatten if all(shape) else "let it observe something, in a wrapper (tasks.wrappers=[module:Name])"
         raise TaskError(
             f"task {name!r} observes {in_short(space)}, expected a vector or an image (one to three dimensions, none "
-            f"empty); {flatten}"
+            f"empty); {remedy}"
         )
     kind = np.dtype(space.dtype).kind if space.dtype is not None else "f"
     if len(shape) == 1:

@@ -16,6 +16,7 @@ import torch
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import ConfigError, TaskError
 from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.gym_spaces import frame_layout
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
@@ -53,7 +54,7 @@ def rewards(suite: TaskSuite, steps: int = 20, num_envs: int = 1) -> list[list[f
         ("NanReward", r"gave the rewards \[nan\], expected finite numbers"),
         ("InfiniteReward", r"gave the rewards \[inf\], expected finite numbers"),
         ("HugeReward", r"gave the rewards \[-1e\+39\], expected finite numbers"),
-        ("TextReward", "gave reward = '1', expected one number"),
+        ("TextReward", "gave reward = '1', expected one number; mend the environment's reward"),
         ("ListReward", r"gave reward = \[1\.0\], expected one number"),
         ("TwoRewards", r"gave reward = array\(\[ 0., -1.\]\), expected one number; make it one in a wrapper"),
         ("WideByte", "gave an observation of type int64, expected uint8"),
@@ -268,6 +269,12 @@ def test_the_global_generators_of_everybody_else_stay_as_they_are() -> None:
 def test_an_environment_made_again_is_the_same_environment() -> None:
     (level,) = {row[0] for row in rewards(suite_of("DrawnWhenMade"))}
     assert rewards(suite_of("DrawnWhenMade"), num_envs=3)[0] == [level] * 3
+
+
+def test_an_empty_observation_is_not_told_to_flatten() -> None:
+    empty = gymnasium.spaces.Box(-1.0, 1.0, (0,), np.float32)
+    with pytest.raises(TaskError, match=r"none empty\); let it observe something"):
+        frame_layout("a", empty, "by_shape")
 
 
 def test_only_environments_of_gymnasium_itself_are_played_in_several_threads_and_kept() -> None:

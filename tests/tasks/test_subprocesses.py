@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from safetensors.torch import load_file
 from switchmt_snn import train
 from switchmt_snn.config import ExperimentConfig, TasksConfig, from_dict
 from switchmt_snn.errors import ConfigError, TaskError
+from switchmt_snn.tasks import gym_processes
 from switchmt_snn.tasks.gym_processes import GymProcesses
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.registry import make_suite
@@ -100,6 +102,23 @@ def test_a_process_that_is_killed_is_an_error_and_the_others_end() -> None:
     for process in processes:
         process.join(10)
         assert not process.is_alive()
+
+
+def test_an_interrupt_while_the_processes_start_ends_those_that_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server is up by then: what it starts later would miss what has been freed, with a traceback."""
+    seen: list[tuple[int, bool]] = []
+
+    def interrupted(*_: Any, context: str, **__: Any) -> None:
+        multiprocessing.get_context(context).Process(target=time.sleep, args=(60,)).start()
+        seen.append((len(multiprocessing.active_children()), gym_processes._start_server.cache_info().currsize == 1))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gym_processes, "AsyncVectorEnv", interrupted)
+    before = len(multiprocessing.active_children())
+    with pytest.raises(KeyboardInterrupt):
+        suite_of("CartPole-v1").make(0, 1)
+    assert seen == [(before + 1, True)]
+    assert len(multiprocessing.active_children()) == before
 
 
 def test_other_suites_refuse_it() -> None:
