@@ -312,23 +312,31 @@ class CheckpointStore:
             raise CheckpointError(f"replay segment {path.name[:12]} has another checksum")
         return content
 
-    def load_model(self, which: str = "last") -> tuple[int, dict[str, torch.Tensor], tuple[str, ...]]:
-        """Weights of the last whole checkpoint or of the best one: step, state dict, damaged checkpoints passed over.
+    def load_model(self, which: str = "last") -> tuple[int, dict[str, torch.Tensor]]:
+        """Step and weights of the last checkpoint, or of the best one.
 
         Raises:
-            CheckpointError: ``which`` is neither ``last`` nor ``best``, or no such checkpoint is whole.
+            CheckpointError: ``which`` is neither ``last`` nor ``best``, there is no such checkpoint, or it is damaged.
+                An older one never takes its place: a score would be of other weights than its reader thinks.
         """
         if which not in ("last", "best"):
             raise CheckpointError(f"the checkpoint is {which!r}, expected last or best")
-        damaged: list[str] = []
-        for path in [self.folder / "best"] if which == "best" else self.paths():
+        paths = [self.folder / "best"] if which == "best" else self.paths()
+        seen, remedy = "none", "run switchmt-snn train first"
+        if paths:
             try:
-                manifest = read_manifest(path)
-                return int(manifest["step"]), _read_tensors(path, _MODEL_FILE, manifest), tuple(damaged)
+                manifest = read_manifest(paths[0])
+                return int(manifest["step"]), _read_tensors(paths[0], _MODEL_FILE, manifest)
             except CheckpointError as error:
-                damaged.append(f"checkpoint {path.name} is damaged ({error})")
-        seen = "; ".join(damaged) if damaged and which != "best" else "none"
-        remedy = "use --checkpoint last" if which == "best" else "run switchmt-snn train first"
+                if which == "best":
+                    remedy = "use --checkpoint last"
+                else:
+                    seen = f"checkpoint {paths[0].name} is damaged ({error})"
+                    remedy = (
+                        "continue the run: training begins at the one before it; or remove this one to use that one"
+                    )
+                    if len(paths) == 1:
+                        remedy = "it is the only one; train again in another folder"
         raise CheckpointError(f"no whole {which} checkpoint in {self.folder} ({seen}), expected one; {remedy}")
 
 

@@ -98,7 +98,7 @@ def read_initial_weights(config: ExperimentConfig, suite: TaskSuite, folder: Pat
             f"initial_weights is {run}, a run with other settings: {shown}; expected the same tasks and the same "
             f"network; begin with its config: switchmt-snn train {source.path / 'config.yaml'} --initial-weights {run}"
         )
-    step, weights, _ = source.checkpoints().load_model()
+    step, weights = source.checkpoints().load_model()
     found = InitialWeights(run, step, weights)
     if folder is not None:
         began = read_environment(folder).get("initial_weights")

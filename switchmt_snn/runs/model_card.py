@@ -38,7 +38,7 @@ def model_card(
         RunFolderError: a log or an evaluation cannot be read.
     """
     config = run.config()
-    step, weights, _ = run.checkpoints().load_model(checkpoint)
+    step, weights = run.checkpoints().load_model(checkpoint)
     environment = read_environment(run.path)
     history = read_history(run.path, config.tasks.names)
     scores = _scores(run, step)

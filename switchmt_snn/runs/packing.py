@@ -110,7 +110,7 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
     folder, out = open_run(run), Path(out)
     if out.exists():
         raise RunFolderError(f"{out} exists, expected a new folder; name another with --out")
-    step, weights, _ = folder.checkpoints().load_model(checkpoint)
+    step, weights = folder.checkpoints().load_model(checkpoint)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as made:

@@ -394,7 +394,7 @@ def load_agent(
     folder = open_run(run)
     config = folder.config()
     suite = make_suite(config.tasks)
-    step, weights, _ = folder.checkpoints().load_model(checkpoint)
+    step, weights = folder.checkpoints().load_model(checkpoint)
     network = build_network(config.network, observation_spec(suite), config.seed)
     with fitting_weights():
         network.load_state_dict(weights)

@@ -203,7 +203,7 @@ def _read_checkpoint(folder: Path, manifest: bytes, weights: bytes) -> None:
     checkpoint.mkdir(exist_ok=True)
     (checkpoint / "manifest.json").write_bytes(manifest)
     (checkpoint / "model.safetensors").write_bytes(weights)
-    step, state, _ = CheckpointStore(folder).load_model()
+    step, state = CheckpointStore(folder).load_model()
     assert step >= 0
     with fitting_weights():
         _network().load_state_dict(state)

@@ -35,7 +35,7 @@ def config(**changes: Any) -> ExperimentConfig:
 
 
 def weights(run: Path, step: int) -> dict[str, torch.Tensor]:
-    found, tensors, _ = CheckpointStore(run / "checkpoints").load_model()
+    found, tensors = CheckpointStore(run / "checkpoints").load_model()
     assert found == step
     return tensors
 

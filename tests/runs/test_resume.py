@@ -303,7 +303,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(
         store.load(training.replays)
 
 
-def test_damage_through_the_command_line(whole: Path, tmp_path: Path) -> None:
+def test_damage_through_the_command_line(config: Path, whole: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
     newest, *_ = sorted(folder.glob("checkpoints/step-*"), reverse=True)
@@ -311,6 +311,11 @@ def test_damage_through_the_command_line(whole: Path, tmp_path: Path) -> None:
     result = run("train", "--run", folder)
     assert f"checkpoint {newest.name} is damaged (training.safetensors has another checksum)" in result.stdout
     assert content(folder) == content(whole), "trained again from the one before, to the same end"
+    damage(newest / "model.safetensors", "bit flipped")
+    for command in (("evaluate", folder), ("train", config, "--initial-weights", folder, "--run", tmp_path / "new")):
+        error = run(*command, check=2).stderr
+        assert f"checkpoint {newest.name} is damaged (model.safetensors has another checksum)" in error
+        assert "training begins at the one before it" in error, "never the weights of the one before, in silence"
     for path in folder.glob("checkpoints/step-*"):
         damage(path / "model.safetensors", "truncated")
     assert "no whole checkpoint" in run("train", "--run", folder, check=2).stderr
