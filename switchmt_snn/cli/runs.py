@@ -24,10 +24,12 @@ def command(argv: list[str]) -> int:
     options = parse(RunsOptions, rest, "runs", RunsOptions())
     from switchmt_snn.runs.folder import RUNS
     from switchmt_snn.runs.listing import list_runs
+    from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.tables import runs_table
 
     path = Path(folder) if folder is not None else RUNS
-    runs, damaged = list_runs(path)
+    with ProgressBars():
+        runs, damaged = list_runs(path)
     for one in damaged:
         print(f"damaged: {one.path.name}: {one.problem}", file=sys.stderr)
     if options.json:

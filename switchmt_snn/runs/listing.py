@@ -10,6 +10,7 @@ from typing import Any
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import RunFolderError, SwitchMTError, reason_of
+from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, read_history
 
@@ -78,11 +79,13 @@ def list_runs(folder: Path) -> tuple[list[RunSummary], list[Damaged]]:
         raise RunFolderError(f"no folder {folder}, expected one with run folders; run switchmt-snn train, or name it")
     found = [folder] if RunFolder(folder).is_run else [path for path in sorted(folder.iterdir()) if _is_trace(path)]
     runs, damaged = [], []
-    for path in found:
-        try:
-            runs.append(summarize(path))
-        except (SwitchMTError, OSError) as error:
-            damaged.append(Damaged(path, reason_of(error)))
+    with progress_of("reading logs", len(found), "runs") as progress:
+        for path in found:
+            try:
+                runs.append(summarize(path))
+            except (SwitchMTError, OSError) as error:
+                damaged.append(Damaged(path, reason_of(error)))
+            progress.advance()
     return sorted(runs, key=lambda run: (datetime.fromisoformat(run.created).astimezone(), run.path.name)), damaged
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from switchmt_snn.machine.progress import Work, listening, progress_of
 from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.listing import list_runs
 from switchmt_snn.study.replayed import replay_policies
 from switchmt_snn.viewing.progress_bar import FIRST_LINE_S, LINES_EVERY_S, ProgressBars
 from switchmt_snn.viewing.report.page import write_report
@@ -114,7 +115,7 @@ def test_a_failure_ends_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
         assert work.listener is None
 
 
-def test_reports_and_replayed_policies_tell_how_far_they_are(tmp_path: Path) -> None:
+def test_reports_lists_and_replayed_policies_tell_how_far_they_are(tmp_path: Path) -> None:
     ended: list[tuple[str, int, int]] = []
 
     class Heard:
@@ -130,8 +131,9 @@ def test_reports_and_replayed_policies_tell_how_far_they_are(tmp_path: Path) -> 
     with listening(Heard()):
         page = write_report([RUNS / "gym", RUNS / "minatar"], tmp_path, figures=True)
         replay_policies(RunFolder(RUNS / "gym"), ("fixed_episodes", "fixed_steps"))
+        list_runs(RUNS)
     figures = len(list((tmp_path / "comparison_figures").glob("*.csv")))
     assert page.is_file()
-    assert [(done, total) for _, done, total in ended] == [(2, 2), (figures, figures), (2, 2)]
+    assert [(done, total) for _, done, total in ended] == [(2, 2), (figures, figures), (2, 2), (2, 2)]
     assert ended[0][0] == "reading logs"
     assert ended[1][0] == "drawing"
