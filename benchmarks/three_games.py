@@ -1,8 +1,8 @@
 """Agent steps per second of the preset `strong` on its three games, by samples per agent step.
 
 ``python -m benchmarks.three_games [--turns 4] [--timesteps 4] [--json]``. Pong, Breakout and Enduro take turns of 240
-steps, eight copies of each, the full channels; batches of 32 of each game, native bfloat16 updates where the processor
-has the instructions. Beside it the plain loop of ``benchmarks.end_to_end`` (Breakout alone, one copy, batches of 32).
+steps, eight copies of each, the full channels, batches of 32 of each game; engine and precision as ``train`` chooses
+them. Beside it the plain loop of ``benchmarks.end_to_end`` (Breakout alone, one copy, batches of 32).
 A sample is one transition in one gradient step. Variants take turns in one process, with as many threads as cores.
 """
 
@@ -16,15 +16,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from benchmarks.end_to_end import BATCH, EPSILON, plain_loop
 from benchmarks.measure import environment, rates
-from switchmt_snn.config import load_config, resolve
+from switchmt_snn.config import load_config
 from switchmt_snn.learning.events import Stepped
 from switchmt_snn.learning.training import Training
 from switchmt_snn.machine.devices import keep_freed_memory
-from switchmt_snn.tasks.registry import make_suite
+from switchmt_snn.runs.plan import plan
 
 GAMES, COPIES, VISIT, STARTS = 3, 8, 240, 300
 FILLED = GAMES * 2 * VISIT  # by then every game's replay is being learned from
@@ -45,7 +43,7 @@ def recipe_loop(steps: int, samples: int, timesteps: int, overlap: bool) -> Iter
         epsilon_end=EPSILON,
         update_every_steps=updates // samples,
     )
-    config = resolve(
+    planned = plan(
         replace(
             base,
             total_steps=steps,
@@ -54,7 +52,7 @@ def recipe_loop(steps: int, samples: int, timesteps: int, overlap: bool) -> Iter
             switching=replace(base.switching, min_stay_steps=VISIT, max_stay_steps=VISIT),
         )
     )
-    training = Training(config, make_suite(config.tasks), torch.device("cpu"))
+    training = Training(planned.config, planned.suite, planned.device)
     for event in training.events():
         if isinstance(event, Stepped):
             yield

@@ -12,6 +12,10 @@ from switchmt_snn.config import load_config
 ROOT = Path(__file__).parents[2]
 
 
+LOOP_GOALS_PER_S = {8: 200, 4: 350}
+"""Agent steps per second that were wanted, by samples per step."""
+
+
 def performance_page() -> str:
     """docs/performance.md: what the benchmarks measured."""
     folder = ROOT / "results" / "performance"
@@ -23,6 +27,7 @@ def performance_page() -> str:
         "acting",
         "environments",
         "end_to_end",
+        "three_games",
         "scaling",
         "replay",
         "replay_agent",
@@ -41,6 +46,7 @@ def performance_page() -> str:
         *against_part(results["against"]),
         *acting_part(results["acting"]),
         *loop_part(results["end_to_end"], results["environments"]),
+        *three_games_part(results["three_games"]),
         *scaling_part(results["scaling"]),
         *replay_part([results["replay"], results["replay_agent"]]),
         *sampling_part([results["replay"], results["replay_agent"]], results["update_step"], results["update_512"]),
@@ -217,6 +223,36 @@ def loop_part(loop: dict[str, Any], environments: dict[str, Any]) -> list[str]:
             lines.append(
                 f"| {game} | {name} | {row['median_per_s']:,.0f} | {row['min_per_s']:,.0f} | {row['max_per_s']:,.0f} |"
             )
+    return lines
+
+
+def three_games_part(games: dict[str, Any]) -> list[str]:
+    """The recipe that learns, as a whole."""
+    machine = games["environment"]
+    reached = {
+        samples: games["variants"][f"ours, {samples} samples per step"]["median_per_s"] for samples in LOOP_GOALS_PER_S
+    }
+    goals = ", ".join(
+        f"{goal} at {samples} ({'reached' if reached[samples] >= goal else 'not reached'})"
+        for samples, goal in LOOP_GOALS_PER_S.items()
+    )
+    lines = [
+        "",
+        "## Three games in one network",
+        "",
+        f"`python -m benchmarks.three_games` on {machine['processor']}, {machine['cores']} cores: the preset `strong`",
+        f"(all channels, quantiles) with T = {games['timesteps']}, Pong, Breakout and Enduro in turns, by samples per",
+        "agent step (a sample is one transition in one gradient step). The plain loop plays Breakout alone. Agent steps",
+        f"per second over {games['turns']} turns; goals were {goals}.",
+        "",
+        "| variant | steps per second | smallest | largest | of the plain loop |",
+        "|---|---|---|---|---|",
+    ]
+    for name, row in games["variants"].items():
+        lines.append(
+            f"| {name} | {row['median_per_s']:.1f} | {row['min_per_s']:.1f} | {row['max_per_s']:.1f} | "
+            f"{row['faster_than_plain_loop']:.2f} |"
+        )
     return lines
 
 
