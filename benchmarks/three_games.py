@@ -47,7 +47,7 @@ def recipe_loop(steps: int, samples: int, timesteps: int, overlap: bool) -> Iter
         replace(
             base,
             total_steps=steps,
-            network=replace(base.network, timesteps=timesteps),
+            network=replace(base.network, trunk="nature", timesteps=timesteps),
             learning=learning,
             switching=replace(base.switching, min_stay_steps=VISIT, max_stay_steps=VISIT),
         )
