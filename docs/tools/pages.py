@@ -268,14 +268,14 @@ def export_page() -> str:
             f"Files written in {parity['wall_s']['write']:.1f} s, play recorded and compared in "
             f"{parity['wall_s']['record_and_compare']:.1f} s.",
             "",
-            "| task | engine | decisions | flips | spikes | largest Q difference | same action |",
+            "| task | runtime | decisions | flips | spikes | largest Q difference | same action |",
             "|---|---|---|---|---|---|---|",
         ]
         for row in parity["recorded"]:
             spikes = sum(row["spikes"].values())
             counts = f"{row['decisions_with_flips']:,} | {spikes:,}" if spikes else "- | -"
             lines.append(
-                f"| {row['task']} | {row['engine']} | {row['decisions']:,} | {counts} | "
+                f"| {row['task']} | {row.get('runtime') or row['engine']} | {row['decisions']:,} | {counts} | "
                 f"{row['largest_q_difference']:.1e} | {row['equal_actions_share']:.2%} |"
             )
         lines.append("")
