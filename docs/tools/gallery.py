@@ -27,15 +27,34 @@ from switchmt_snn.viewing.tables import runs_table
 
 ROOT = Path(__file__).parents[2]
 PICTURES = ROOT / "docs" / "pictures"
-MOST_BYTES = 3_000_000
+MOST_BYTES = 4_000_000
 """Of all pictures together, so that a clone stays small."""
-MOST_BYTES_OF_A_FILM = 1_500_000
-FILM_FROM, FILM_FRAMES, FILM_FPS = 160, 90, 15
-"""Which decisions of pretrained/pong the film shows: two points won, in real time."""
+MOST_BYTES_OF_A_FILM = 2_000_000
+FILM_FRAMES, FILM_FPS = 90, 15
+"""Length of a film in decisions, and how many of them pass in a second of real time."""
 FILM_WIDTH, FILM_COLOURS = 960, 64
 _TEXT_COLUMNS = 96
 _COLOURS = 256
 """Of a photograph of a page: few enough for a small file; the rarest colour of a chart is kept."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """A part of what ``play`` shows.
+
+    Attributes:
+        command: arguments of ``switchmt-snn play``.
+        first: the film's first decision.
+    """
+
+    command: tuple[str, ...]
+    first: int
+
+
+FILMS = {
+    "atari": Film(("pretrained/atari", "--task", "pong", "--task", "breakout", "--task", "enduro", "--seed", "3"), 90),
+    "pong": Film(("pretrained/pong",), 160),  # two points won
+}
 
 
 @dataclass(frozen=True)
@@ -79,7 +98,12 @@ What the commands make. `python -m docs.gallery` makes the pictures anew (it nee
 Chromium), `python -m docs.generate` the text; do not edit. The networks come with the package (`pretrained/...`), the
 runs lie under `results/`.
 
-## A film: the game beside the network's spikes
+## A film: games beside the network's spikes
+
+![One network plays Pong, Breakout and Enduro, beside its spikes, Q-values and dendritic gains](pictures/atari.gif)
+
+`switchmt-snn play pretrained/atari --task pong --task breakout --task enduro`: one spiking network, three games,
+{seconds:g} seconds in real time. Its gains are others in each game. Pong alone:
 
 ![pretrained/pong wins two points, beside the spikes of its layers and its Q-values](pictures/pong.gif)
 
@@ -141,19 +165,19 @@ def gallery_page() -> str:
     return _TEXT.format(seconds=FILM_FRAMES / FILM_FPS, run=MINATAR[0], runs=runs)
 
 
-def make_film(folder: Path) -> None:
-    """pictures/pong.gif."""
-    last = FILM_FROM + FILM_FRAMES
-    _run(folder, "play", "pretrained/pong", "--seconds", f"{last / FILM_FPS:g}", "--out", "pong")
-    frames = ("-framerate", f"{FILM_FPS}", "-start_number", f"{FILM_FROM}", "-i", "pong/frame_%06d.png")
-    palette = f"palettegen=max_colors={FILM_COLOURS}[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    look = ("-filter_complex", f"scale={FILM_WIDTH}:-2:flags=area,split[a][b];[a]{palette}")
-    film = folder / "pong.gif"
-    words = [_ffmpeg(), "-loglevel", "error", "-y", *frames, "-frames:v", f"{FILM_FRAMES}", *look, str(film)]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    if done.returncode:
-        raise TrainingFailed(f"ffmpeg could not write {film} ({done.stderr.strip()[-160:]}), expected a GIF")
-    _keep("pong.gif", film.read_bytes(), MOST_BYTES_OF_A_FILM)
+def make_films(folder: Path) -> None:
+    """pictures/NAME.gif of ``FILMS``."""
+    for name, film in FILMS.items():
+        _run(folder, "play", *film.command, "--seconds", f"{(film.first + FILM_FRAMES) / FILM_FPS:g}", "--out", name)
+        frames = ("-framerate", f"{FILM_FPS}", "-start_number", f"{film.first}", "-i", f"{name}/frame_%06d.png")
+        palette = f"palettegen=max_colors={FILM_COLOURS}[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+        look = ("-filter_complex", f"scale={FILM_WIDTH}:-2:flags=area,split[a][b];[a]{palette}")
+        made = folder / f"{name}.gif"
+        words = [_ffmpeg(), "-loglevel", "error", "-y", *frames, "-frames:v", f"{FILM_FRAMES}", *look, str(made)]
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+        if done.returncode:
+            raise TrainingFailed(f"ffmpeg could not write {made} ({done.stderr.strip()[-160:]}), expected a GIF")
+        _keep(made.name, made.read_bytes(), MOST_BYTES_OF_A_FILM)
 
 
 def make_frame(folder: Path) -> None:
@@ -222,7 +246,7 @@ def _ffmpeg() -> str:
     return str(imageio_ffmpeg.get_ffmpeg_exe())
 
 
-MAKERS: dict[str, Callable[[Path], None]] = {"film": make_film, "frame": make_frame, "figures": make_figures}
+MAKERS: dict[str, Callable[[Path], None]] = {"films": make_films, "frame": make_frame, "figures": make_figures}
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -247,7 +271,7 @@ def _make(names: list[str], browser: str | None) -> None:
     """What is missing is said before anything is made."""
     pages = [name for name in names if name in PAGES]
     program = (browser or find_browser()) if pages else None
-    if "film" in names:
+    if "films" in names:
         _ffmpeg()
     with tempfile.TemporaryDirectory(prefix="gallery-") as made:
         folder = Path(made)

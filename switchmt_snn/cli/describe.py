@@ -32,11 +32,11 @@ def command(argv: list[str]) -> int:
     from switchmt_snn.viewing.tables import layers_table, methods_table
 
     config = options.experiment
+    methods = describe(config)
     told = for_another_suite(source, default, config, rest, "describe")
     if told is not None:
         output.console(stderr=options.json).print(told, highlight=False, soft_wrap=True)
     source = source or "quickstart"
-    methods = describe(config)
     if options.json:
         facts: dict[str, Any] = {"config": config.name, "source": source, "available_memory_bytes": available_bytes()}
         output.print_json({**facts, "methods": {name: method.to_dict() for name, method in methods.items()}})

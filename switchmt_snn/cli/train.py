@@ -53,9 +53,7 @@ def command(argv: list[str]) -> int:
 
     console = output.console(stderr=options.json)
     told = for_another_suite(source, default, config, rest, "train")
-    if told is not None:
-        console.print(told, highlight=False, soft_wrap=True)
-    observers: list[Observer] = [Progress(console), *chosen_dashboards(config.recording)]
+    observers: list[Observer] = [Progress(console, told), *chosen_dashboards(config.recording)]
     result = train(options.experiment, options.run, observers)
     if result.status == "served":
         return 0

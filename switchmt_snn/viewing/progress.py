@@ -27,8 +27,10 @@ LIVE_EVERY_S = 0.5
 class Progress:
     """An observer that shows where a run stands; see ``switchmt_snn.runs.run.Observer``."""
 
-    def __init__(self, console: Console | None = None) -> None:
+    def __init__(self, console: Console | None = None, first: str | None = None) -> None:
+        """Write to ``console``, ``first`` above all else: once nothing can be refused any more."""
         self.console = console or Console()
+        self._first = first
         self._live: Live | None = None
         self._epsilon = 1.0
         self._warming_up = False
@@ -45,6 +47,8 @@ class Progress:
         self._training = training
         self._returns: list[deque[float]] = [deque(maxlen=RETURN_WINDOW_EPISODES) for _ in training.suite.names]
         self._speed = Speed(time.monotonic(), training.steps)
+        if self._first is not None:
+            self.note(self._first)
         config = training.config
         network, suite = config.network, suite_of(config.tasks)
         frames = f" ({config.total_steps * suite.frame_skip:,} emulator frames)" if suite.frames_per_s else ""

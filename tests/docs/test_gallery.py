@@ -17,19 +17,20 @@ ROOT = Path(__file__).parents[2]
 def test_every_picture_is_there_and_shown() -> None:
     shown = set(re.findall(r"\]\(pictures/(\S+)\)", (ROOT / "docs" / "gallery.md").read_text("utf-8")))
     assert shown == {path.name for path in gallery.PICTURES.iterdir()}
-    assert "](docs/pictures/pong.gif)" in (ROOT / "README.md").read_text("utf-8").split("## Start")[0]
+    assert "](docs/pictures/atari.gif)" in (ROOT / "README.md").read_text("utf-8").split("## Start")[0]
 
 
 def test_pictures_are_small_and_whole() -> None:
     paths = list(gallery.PICTURES.iterdir())
     assert sum(path.stat().st_size for path in paths) < gallery.MOST_BYTES
-    assert (gallery.PICTURES / "pong.gif").stat().st_size < gallery.MOST_BYTES_OF_A_FILM
     for path in paths:
         with Image.open(path) as picture:
             picture.load()
             assert picture.width >= 480, path
-    with Image.open(gallery.PICTURES / "pong.gif") as film:
-        assert getattr(film, "n_frames", 1) == gallery.FILM_FRAMES
+    for name in gallery.FILMS:
+        assert (gallery.PICTURES / f"{name}.gif").stat().st_size < gallery.MOST_BYTES_OF_A_FILM
+        with Image.open(gallery.PICTURES / f"{name}.gif") as film:
+            assert getattr(film, "n_frames", 1) == gallery.FILM_FRAMES
 
 
 def test_a_machine_without_a_browser_is_told_what_is_missing(
@@ -38,7 +39,7 @@ def test_a_machine_without_a_browser_is_told_what_is_missing(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingExtraError, match=r"no browser .* apt-get install chromium"):
         browser.find_browser()
-    monkeypatch.setitem(gallery.MAKERS, "film", lambda folder: pytest.fail("a film was made first"))
+    monkeypatch.setitem(gallery.MAKERS, "films", lambda folder: pytest.fail("a film was made first"))
     with pytest.raises(SystemExit) as stop:
         gallery.main([])
     assert stop.value.code == 2
