@@ -30,7 +30,8 @@ def assert_sound(page: Path) -> None:
     with opened() as window:
         for view in VIEWS:
             look = window.look(page, view)
-            assert (look.too_wide, look.complaints, look.requests) == ((), (), ()), view
+            faults = (look.too_wide, look.complaints, look.requests)
+            assert faults == ((), (), ()), (view, faults)
             if view in AUDITED:
                 window.evaluate(f"{axe}; 0")
                 assert window.evaluate(AUDIT) == [], view

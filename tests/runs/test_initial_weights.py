@@ -16,6 +16,7 @@ from switchmt_snn.cli import main
 from switchmt_snn.config import ExperimentConfig, from_dict
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.checkpoint import CheckpointStore
+from switchmt_snn.runs.packing import pretrained_names
 
 pytestmark = pytest.mark.slow
 
@@ -114,7 +115,8 @@ def test_a_name_that_is_no_run_is_one_line(tmp_path: Path, capsys: pytest.Captur
     assert stop.value.code == 2
     said = capsys.readouterr().err
     assert "no pretrained run 'pang'" in said
-    assert "expected a run folder or one of pretrained/cartpole, pretrained/pong" in said
+    names = ", ".join(f"pretrained/{name}" for name in pretrained_names())
+    assert f"expected a run folder or one of {names}" in said
 
 
 def test_a_pretrained_network_learns_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
