@@ -72,9 +72,10 @@ than in three-held-s1 (one seed each). All three games rise between the last two
 three-held-s2 with seed 3, in bfloat16 on a processor with AVX-512; stopped after 455,856 of 1,000,000 steps for lack
 of machine time. The hours below hold 14 minutes in which it was paused.
 **One spiking network plays three games: Pong 10.8 ± 1.4 (random -20.2, SwitchMT of the paper -8.8), Breakout 8.5 ± 0.7
-(1.2, 5.6), Enduro 124.4 ± 3.7 (0, 355).** In Pong and Breakout it is above every row of the paper's table; in Enduro it
-is far below, and still rising (177,624 steps of its own). Pong is won after 173,000 steps of its own. One seed; the
-evaluations at 200,000 and 400,000 steps are of 10 episodes. The weights come with the package: `pretrained/atari`.
+(1.2, 5.6), Enduro 124.4 ± 3.7 (0, 355).** In Pong and Breakout it is above every network of the paper's table; in
+Enduro it is far below, and still rising (177,624 steps of its own). Pong is won after 173,000 steps of its own. One
+seed; the evaluations at 200,000 and 400,000 steps are of 10 episodes. The weights come with the package:
+`pretrained/atari`.
 """,
 }
 """What a reader must know of a run."""
