@@ -328,10 +328,11 @@ class CheckpointStore:
                 manifest = read_manifest(paths[0])
                 return int(manifest["step"]), _read_tensors(paths[0], _MODEL_FILE, manifest)
             except CheckpointError as error:
+                if paths[0].exists():
+                    seen = f"checkpoint {paths[0].name} is damaged ({error})"
                 if which == "best":
                     remedy = "use --checkpoint last"
                 else:
-                    seen = f"checkpoint {paths[0].name} is damaged ({error})"
                     remedy = (
                         "continue the run: training begins at the one before it; or remove this one to use that one"
                     )

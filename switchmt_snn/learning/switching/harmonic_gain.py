@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from switchmt_snn.config import SwitchingConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.switching.criterion import EpisodeRecord, Verdict, register_criterion
 from switchmt_snn.learning.switching.learning_progress import LearningProgress
@@ -29,9 +28,6 @@ class HarmonicGain(LearningProgress):
     """
 
     columns: ClassVar[tuple[str, ...]] = ("score", *LearningProgress.columns)
-
-    def __init__(self, config: SwitchingConfig) -> None:
-        super().__init__(config)
 
     def meet_tasks(self, num_tasks: int, references: tuple[Reference | None, ...]) -> None:
         """Take the reference scores.
