@@ -106,3 +106,12 @@ def test_the_end_of_a_run_names_its_best_weights(tmp_path: Path, capsys: pytest.
     assert f"describe '{tmp_path / 'a run' / 'config.yaml'}'" in out
     following = [line.strip() for line in out.split("Next:\n")[1].splitlines()[:-1]]
     assert len(following) >= 5
+
+
+def test_a_damaged_best_checkpoint_is_named_and_a_missing_one_is_not_called_damaged(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no whole best checkpoint in .* \(none\), .*use --checkpoint last"):
+        CheckpointStore(tmp_path).load_model("best")
+    (tmp_path / "best").mkdir()
+    (tmp_path / "best" / "manifest.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"checkpoint best is damaged .*use --checkpoint last"):
+        CheckpointStore(tmp_path).load_model("best")
