@@ -12,6 +12,8 @@ import numpy.typing as npt
 from switchmt_snn.config import ExperimentConfig, clips_rewards
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import TaskError
+from switchmt_snn.tasks.gym_make import make_environment
+from switchmt_snn.tasks.gym_spaces import rounding
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -61,6 +63,12 @@ def check_before_training(config: ExperimentConfig, tasks: TaskSuite) -> tuple[s
                     "to [-1, 1] for learning, which changes what is best; learning.clip_rewards=false learns from them "
                     f"as they are (smaller rewards{helping} then help)"
                 )
+            seen_values = max(float(np.abs(seen[0]).max()) for seen in first)
+            made = make_environment(name, config.tasks.wrappers)
+            rounded = rounding(made.observation_space, seen_values)
+            made.close()
+            if rounded is not None:
+                notes.append(f"warning: task {name!r}: {rounded}")
             step = differs_from(first, second)
             if step is not None:
                 notes.append(

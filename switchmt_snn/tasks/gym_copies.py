@@ -66,8 +66,10 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         if self._before_reset is not None:
             self._before_reset(self.env)
         with self._generators or _NOTHING:
-            observation, _ = self.env.reset(seed=seed)
-        return self._frame(observation), {}
+            answer = self.env.reset(seed=seed)
+        if not (isinstance(answer, tuple) and len(answer) == 2):
+            raise TaskError(f"task {self._name!r} gave {shown(answer)} from reset, expected (observation, info)")
+        return self._frame(answer[0]), {}
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step; the environment's info is left out."""
@@ -105,13 +107,21 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
     def _frame(self, observation: Any) -> npt.NDArray[Any]:
         """Compare an observation with its space, and make its frame."""
         space = self.env.observation_space
-        seen = np.shape(observation)
-        if seen != space.shape:
+        try:
+            array = np.asarray(observation)
+        except (ValueError, TypeError):  # a tuple or list of unequal lengths
+            array = np.asarray(None)
+        if array.dtype.kind == "O" or array.ndim == 0:
             raise TaskError(
-                f"task {self._name!r} gave an observation of shape {seen}, expected {space.shape}, the shape of its "
-                "observation_space"
+                f"task {self._name!r} gave the {type(observation).__name__} {shown(observation)} as observation, "
+                f"expected an array of shape {space.shape} and type {space.dtype}, as its observation_space says; "
+                "return what it declares, or declare what it returns"
             )
-        array = np.asarray(observation)
+        if array.shape != space.shape:
+            raise TaskError(
+                f"task {self._name!r} gave an observation of shape {array.shape}, expected {space.shape}, the shape of "
+                "its observation_space"
+            )
         if not np.can_cast(array.dtype, space.dtype or np.float32, "same_kind"):
             raise TaskError(
                 f"task {self._name!r} gave an observation of type {array.dtype}, expected {space.dtype}, the type of "

@@ -16,6 +16,9 @@ ImageLayout = Literal["by_shape", "channels_last", "channels_first"]
 FEW_CHANNELS = 4
 """Most channels that an image is expected to have where only its shape tells which axis they are."""
 
+LARGEST_WHOLE = 2**24
+"""float32 holds every whole number up to this one; of larger ones at best every second."""
+
 
 @dataclass(frozen=True)
 class FrameLayout:
@@ -92,6 +95,29 @@ def frame_layout(
     if image_layout == "channels_first":
         return FrameLayout("channels_first", shape, scale)
     return FrameLayout("channels_last", (shape[2], *shape[:2]), scale)
+
+
+def rounding(space: gymnasium.Space[Any], largest_seen: float) -> str | None:
+    """What a user should know where vectors hold numbers that float32, which networks take, rounds to others.
+
+    Args:
+        space: ``observation_space``.
+        largest_seen: the largest absolute value of a play.
+
+    >>> rounding(gymnasium.spaces.Box(0, 255, (2,), np.int32), 0.0) is None
+    True
+    """
+    kind = np.dtype(space.dtype)
+    if not isinstance(space, gymnasium.spaces.Box) or np.can_cast(kind, np.float32):
+        return None
+    declared = max(abs(int(np.min(space.low))), abs(int(np.max(space.high)))) if kind.kind in "iu" else 0
+    if max(declared, largest_seen) < LARGEST_WHOLE:
+        return None
+    source = f"declares whole numbers up to {declared:,}" if declared else f"is {kind}, and gave {largest_seen:,.0f}"
+    return (
+        f"its observation_space {source}; networks take float32, which rounds whole numbers above {LARGEST_WHOLE:,}; "
+        "declare the bounds that they have, or scale or split them in a wrapper (tasks.wrappers)"
+    )
 
 
 def with_wrapper(wrappers: Sequence[str], wrapper: str) -> str:

@@ -11,13 +11,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.check import FROM_ITS_SEED, differs_from, journal, one_episode
 from switchmt_snn.tasks.gym_copies import GymCopies
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import frame_layout
+from switchmt_snn.tasks.gym_spaces import frame_layout, rounding
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import make_suite, suite_of
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite
@@ -204,7 +205,7 @@ def _report(config: TasksConfig, tasks: TaskSuite, task: int, asked: _Asked) -> 
         same_in_threads=_same_in_threads(tasks, task, compared, seed, first),
         steps_per_s=played.steps_per_s,
     )
-    return replace(report, notes=tuple(_notes(report, facts["bounds"], suite_of(config).defaults.clip_rewards)))
+    return replace(report, notes=tuple(_notes(report, facts["space"], suite_of(config).defaults.clip_rewards)))
 
 
 class _Played:
@@ -276,7 +277,7 @@ def _same_in_threads(tasks: TaskSuite, task: int, steps: int, seed: int, expecte
 def _gym_facts(config: TasksConfig, task: int) -> dict[str, Any]:
     """What only a Gymnasium environment says of itself."""
     if config.suite != "gym":
-        return {"observes": None, "layout": None, "limit_steps": None, "bounds": None}
+        return {"observes": None, "layout": None, "limit_steps": None, "space": None}
     env = make_environment(config.names[task], config.wrappers)
     space = env.observation_space
     layout = frame_layout(config.names[task], space, config.image_layout)
@@ -284,15 +285,14 @@ def _gym_facts(config: TasksConfig, task: int) -> dict[str, Any]:
         "observes": " ".join(str(space).split()),
         "layout": layout.kind,
         "limit_steps": None if env.spec is None else env.spec.max_episode_steps,
-        "bounds": (float(np.min(space.low)), float(np.max(space.high))),  # type: ignore[attr-defined]
+        "space": space,
     }
     env.close()
     return facts
 
 
-def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None, clips: bool) -> list[str]:
+def _notes(report: EnvironmentReport, space: Box | None, clips: bool) -> list[str]:
     notes = []
-    low, high = report.observed
     if not report.repeats:
         notes.append(
             "the same seed and actions do not give the same play: scores differ from one evaluation to the next, and a "
@@ -319,22 +319,34 @@ def _notes(report: EnvironmentReport, bounds: tuple[float, float] | None, clips:
             f"no episode ended in {report.steps:,} steps, and the environment {limit} (max_episode_steps); evaluations "
             "cut episodes off after evaluation.max_episode_steps"
         )
-    if bounds is not None and not (bounds[0] <= low and high <= bounds[1]):
-        notes.append(
-            f"observations from {low:g} to {high:g} leave the space's bounds from {bounds[0]:g} to {bounds[1]:g}"
-        )
-    if report.scale < 1 and high <= 32:
-        notes.append(
-            f"pixels up to {high:g} of 255: the network sees {high * report.scale:.2g} at most; spread them in a "
-            "wrapper (tasks.wrappers)"
-        )
-    if report.layout == "vector" and max(-low, high) > 100:
-        notes.append(f"values up to {max(-low, high):g} reach the network as they are; scale them in a wrapper")
+    notes += _notes_on_values(report, space)
     largest = max(-report.rewards[0], report.rewards[1])
     if largest > 1:
         default = f"learning.clip_rewards ({str(clips).lower()} by default in the suite {report.suite})"
         effect = "clips them to [-1, 1]" if clips else "leaves them; a Huber loss or smaller rewards help"
         notes.append(f"rewards up to {largest:g}: {default} {effect}")
+    return notes
+
+
+def _notes_on_values(report: EnvironmentReport, space: Box | None) -> list[str]:
+    notes = []
+    low, high = report.observed
+    if space is not None:
+        lowest, highest = float(np.min(space.low)), float(np.max(space.high))
+        if not (lowest <= low and high <= highest):
+            notes.append(
+                f"observations from {low:g} to {high:g} leave the space's bounds from {lowest:g} to {highest:g}"
+            )
+    rounded = None if space is None else rounding(space, max(-low, high))
+    if report.scale < 1 and high <= 32:
+        notes.append(
+            f"pixels up to {high:g} of 255: the network sees {high * report.scale:.2g} at most; spread them in a "
+            "wrapper (tasks.wrappers)"
+        )
+    if rounded is not None:
+        notes.append(rounded)
+    elif report.layout == "vector" and max(-low, high) > 100:
+        notes.append(f"values up to {max(-low, high):g} reach the network as they are; scale them in a wrapper")
     return notes
 
 

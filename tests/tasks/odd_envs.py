@@ -50,6 +50,43 @@ class LongObservation(Plain):
         return later(super().observe(), np.zeros(9, np.float32), self)
 
 
+class DictObservation(Plain):
+    """Declares four numbers, and gives them by name."""
+
+    def observe(self) -> Any:
+        return later(super().observe(), {"a": 0.5, "b": np.zeros(3)}, self)
+
+
+class TupleObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), (np.zeros(2), np.zeros(3)), self)
+
+
+class UnequalObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), [[0.0], [1.0, 2.0], 0.0, 0.0], self)
+
+
+class NoObservation(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), None, self)
+
+
+class OneNumber(Plain):
+    def observe(self) -> Any:
+        return later(super().observe(), 3, self)
+
+
+class ResetWithoutInfo(Plain):
+    """As environments before Gymnasium; two numbers, so that they could be unpacked."""
+
+    observation_space = Box(-10.0, 10.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32)
+
+
 class TextObservation(Plain):
     def observe(self) -> Any:
         return later(super().observe(), np.asarray(["a"] * 4), self)
@@ -349,6 +386,22 @@ class Large(Plain):
 
     def observe(self) -> Any:
         return np.full(4, 100.0 * self.steps, np.float32)
+
+
+class Timestamps(Plain):
+    """Whole numbers that float32 rounds."""
+
+    observation_space = Box(0, 2**31 - 1, (4,), np.int64)
+
+    def observe(self) -> Any:
+        return np.full(4, 1_700_000_001 + self.steps)
+
+
+class DoubleTimestamps(Plain):
+    observation_space = Box(-np.inf, np.inf, (4,), np.float64)
+
+    def observe(self) -> Any:
+        return np.full(4, 2.0**24 + self.steps)
 
 
 class ManyBounds(Plain):

@@ -16,7 +16,7 @@ import torch
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import ConfigError, TaskError
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import frame_layout
+from switchmt_snn.tasks.gym_spaces import frame_layout, rounding
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
@@ -48,6 +48,16 @@ def rewards(suite: TaskSuite, steps: int = 20, num_envs: int = 1) -> list[list[f
             r"gave an observation of shape \(2,\), expected \(4,\), the shape of its obs",
         ),
         ("LongObservation", r"gave an observation of shape \(9,\), expected \(4,\)"),
+        (
+            "DictObservation",
+            r"gave the dict \{'a': 0.5, 'b': array\(\[0., 0., 0.\]\)\} as observation, expected an array of "
+            r"shape \(4,\) and type float32, as its observation_space says; return what it declares, or declare what "
+            "it returns$",
+        ),
+        ("TupleObservation", r"gave the tuple \(array\(\[0., 0.\]\), .*\) as observation, expected an array of shape"),
+        ("UnequalObservation", r"gave the list \[\[0.0\], \[1.0, 2.0\], 0.0, 0.0\] as observation, expected an array"),
+        ("NoObservation", "gave the NoneType None as observation, expected an array"),
+        ("OneNumber", "gave the int 3 as observation, expected an array"),
         ("TextObservation", "gave an observation of type <U1, expected float32, the type of its observation_space"),
         ("NanObservation", "gave observations from nan to nan, expected finite numbers"),
         ("HugeObservation", "gave observations from inf to inf, expected finite numbers"),
@@ -71,6 +81,30 @@ def test_what_an_environment_returns_is_compared_with_its_spaces_at_every_step(n
 
 
 @pytest.mark.filterwarnings("ignore")  # Gymnasium's own checker asks for an array
+def test_a_reset_without_info_is_named() -> None:
+    """Gymnasium's own checker only warns."""
+    with pytest.raises(TaskError, match=r"gave array\(\[0., 0.\].*\) from reset, expected \(observation, info\)"):
+        begun(suite_of("ResetWithoutInfo"))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "high", "seen", "noted"),
+    [
+        (np.float32, 1e30, 1e30, False),
+        (np.int16, 32767, 32767, False),
+        (np.int32, 2**24 - 1, 100, False),
+        (np.int32, 2**24, 100, True),
+        (np.uint32, 2**32 - 1, 0, True),
+        (np.int64, 2**62, 0, True),
+        (np.float64, np.inf, 2**24 - 1, False),
+        (np.float64, np.inf, 2**24, True),
+    ],
+)
+def test_whole_numbers_that_float32_rounds_are_noted(dtype: type, high: float, seen: float, noted: bool) -> None:
+    assert (rounding(gymnasium.spaces.Box(0, high, (2,), dtype), seen) is not None) == noted
+
+
+@pytest.mark.filterwarnings("ignore")  # as above
 def test_numbers_that_a_space_can_hold_are_taken() -> None:
     play = begun(suite_of("DoubleObservation"))
     play.step(np.asarray([0]))

@@ -68,6 +68,11 @@ def test_the_facts_of_a_plain_environment() -> None:
         ("Endless", "no episode ended in 120 steps, and the environment has no limit"),
         ("Endless", "observations from 0 to 12 leave the space's bounds from -10 to 10"),
         ("Large", "values up to 3000 reach the network as they are"),
+        (
+            "Timestamps",
+            "its observation_space declares whole numbers up to 2,147,483,647; networks take float32, which",
+        ),
+        ("DoubleTimestamps", "its observation_space is float64, and gave 16,777,2[0-9]{2}; networks take float32"),
         ("FaintImage", "pixels up to 10 of 255"),
     ],
 )
@@ -240,6 +245,14 @@ def test_a_run_says_before_it_starts_that_an_environment_is_no_function_of_its_s
     (note,) = check_before_training(config, make_suite(config.tasks))
     assert re.match(f"warning: task '{MODULE}:{name}-v0' {warning}", note)
     assert note.endswith(f"; {FROM_ITS_SEED}")
+
+
+def test_a_run_says_before_it_starts_that_float32_rounds_observations() -> None:
+    config = from_dict({"tasks": {"suite": "gym", "names": [f"{MODULE}:Timestamps-v0"]}})
+    (note,) = check_before_training(config, make_suite(config.tasks))
+    assert note.startswith(
+        f"warning: task '{MODULE}:Timestamps-v0': its observation_space declares whole numbers up to"
+    )
 
 
 @pytest.mark.slow
