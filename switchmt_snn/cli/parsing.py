@@ -14,7 +14,8 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from switchmt_snn.config import ExperimentConfig, load_config, presets
 from switchmt_snn.config.numbers import whole_number
-from switchmt_snn.errors import ConfigError
+from switchmt_snn.config.other_names import meant
+from switchmt_snn.errors import ConfigError, printable
 from switchmt_snn.machine.program import runnable
 
 ARGUMENTS = {
@@ -268,12 +269,31 @@ def parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        raise ConfigError(_one_line(complaint.getvalue(), command)) from None
+        unknown = _unknown_flags(kind, argv, command, default)
+        raise ConfigError(unknown or _one_line(complaint.getvalue(), command)) from None
 
 
 def _renamed(word: str, renamed: dict[str, str]) -> str:
     flag, equals, value = word.partition("=")
     return renamed.get(flag, flag) + equals + value
+
+
+def _unknown_flags(kind: Any, argv: list[str], command: str, default: Any) -> str:
+    """The flags that the command does not have, each with what was probably meant; nothing if it has all."""
+    parser = tyro.extras.get_parser(kind, default=default, registry=_REGISTRY)
+    flags = {flag for action in parser._actions for flag in action.option_strings}
+    settings = {flag.removeprefix("--").replace("-", "_"): flag for flag in flags}
+    told = []
+    for word in argv:
+        flag = word.partition("=")[0]
+        if not word.startswith("--") or flag.replace("_", "-") in flags:
+            continue
+        near = [settings[name] for name in meant(flag.removeprefix("--").replace("-", "_"), settings)]
+        told.append(printable(flag) + (f" (did you mean {' or '.join(near)}?)" if near else ""))
+    if not told:
+        return ""
+    hint = f"; {_ON_OR_OFF}" if argv[-1].lower() in ("true", "false") else ""
+    return f"{command} has no option {', '.join(told)}{hint}; see switchmt-snn {command} --help"
 
 
 def _one_line(boxed: str, command: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 import typing
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import yaml
 from switchmt_snn.config.checks import field_types
 from switchmt_snn.config.decided import KEY, closed, opened, presumably_open, record
 from switchmt_snn.config.experiment import ExperimentConfig
+from switchmt_snn.config.other_names import OTHER_NAMES, meant
 from switchmt_snn.config.strict_yaml import parse_yaml, read_text
-from switchmt_snn.errors import ConfigError, did_you_mean, printable
+from switchmt_snn.errors import ConfigError, did_you_mean, nearest, printable
 
 
 def load_config(
@@ -139,10 +141,19 @@ def _build(cls: type[Any], data: object, where: str, prefix: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in data.items():
         if key not in fields:
-            raise ConfigError(f"{where}: unknown key {prefix}{printable(key)}{did_you_mean(str(key), fields)}")
+            raise ConfigError(f"{where}: unknown key {prefix}{printable(key)}{_meant(prefix, str(key), fields)}")
         nested = dataclasses.is_dataclass(fields[key])
         values[key] = _build(fields[key], value, where, f"{prefix}{key}.") if nested else value
     try:
         return cls(**values)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
+
+
+def _meant(prefix: str, key: str, fields: Iterable[str]) -> str:
+    """What an unknown key probably means: a setting of this name elsewhere, or the nearest, here first."""
+    settings = _flatten(to_dict(ExperimentConfig()))
+    exists = key in OTHER_NAMES or any(name.endswith(f".{key}") for name in settings)
+    here = "" if exists else nearest(key, fields)
+    elsewhere = " or ".join(meant(prefix + key, settings))
+    return here or (f"; did you mean {elsewhere}?" if elsewhere else did_you_mean(key, fields))

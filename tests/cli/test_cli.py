@@ -276,6 +276,26 @@ def test_command_line_surface_is_frozen() -> None:
     assert surface().splitlines() == SURFACE.read_text().splitlines(), "meant so? python -m tests.cli.surface"
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ("train", "--total-timesteps", "100"),
+            "train has no option --total-timesteps (did you mean --total-steps?); see",
+        ),
+        (("train", "--lr", "0.1"), "train has no option --lr (did you mean --learning.learning-rate?); see"),
+        (("train", "--xyz=3", "--seeed", "4"), "train has no option --xyz, --seeed (did you mean --seed?); see"),
+        (("evaluate", "--episode", "3"), "evaluate has no option --episode (did you mean --episodes?); see"),
+    ],
+)
+def test_an_unknown_option_is_one_short_line_with_the_option_that_was_meant(words, told: str, capsys) -> None:
+    code, out, err = call(capsys, *words)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"switchmt-snn: {told}")
+    assert err.count("\n") == 1
+    assert len(err) < 160
+
+
 @pytest.mark.slow
 def test_every_setting_of_the_config_is_an_option_of_train_and_describe() -> None:
     for command in ("train", "describe"):

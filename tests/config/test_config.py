@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from switchmt_snn.config import (
     resolve,
     to_yaml,
 )
+from switchmt_snn.config.other_names import OTHER_NAMES
 from switchmt_snn.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -144,3 +146,23 @@ def test_generated_pages_are_up_to_date() -> None:
 
 def test_defaults_are_a_valid_config() -> None:
     assert resolve(ExperimentConfig()).network.method == "SwitchMT"
+
+
+def test_every_name_of_another_library_means_a_setting_that_exists() -> None:
+    settings = {key for _, _, rows in field_documentation() for key, *_ in rows}
+    assert set(OTHER_NAMES.values()) <= settings
+    assert not set(OTHER_NAMES) & settings
+
+
+@pytest.mark.parametrize(
+    ("data", "meant"),
+    [
+        ({"learning": {"gamma": 0.9}}, "did you mean learning.discount?"),
+        ({"learning_rate": 0.1}, "did you mean learning.learning_rate?"),
+        ({"network": {"batch_size": 3}}, "did you mean learning.batch_size?"),
+        ({"env_id": "CartPole-v1"}, "did you mean tasks.names?"),
+    ],
+)
+def test_a_key_of_another_library_or_section_is_told_ours(data: dict[str, object], meant: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(meant)):
+        from_dict(data)

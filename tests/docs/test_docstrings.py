@@ -12,6 +12,7 @@ import pytest
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config
 from switchmt_snn.config.numbers import exact, whole_number
+from switchmt_snn.config.other_names import meant
 from switchmt_snn.drawing.chart import ticks
 from switchmt_snn.drawing.numbers import bytes_of, compact, duration
 from switchmt_snn.errors import printable, shown
@@ -59,6 +60,7 @@ EXAMPLES: tuple[Any, ...] = (
     holm,
     makespan,
     file_name,
+    meant,
     json_text,
     make_environment,
     with_wrapper,
