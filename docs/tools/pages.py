@@ -26,6 +26,7 @@ from docs.tools.pretrained_page import pretrained_cards, pretrained_page
 from docs.tools.profile_spread import spread
 from docs.tools.recipe_page import recipe_page
 from docs.tools.reliability_page import reliability_page
+from docs.tools.results_page import results_page
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import field_documentation, load_config
 from switchmt_snn.export.report.page import microjoule
@@ -363,6 +364,7 @@ PAGES = {
     "switchmt_snn/pretrained/README.md": pretrained_page,
     **pretrained_cards(),
     "results/atari/README.md": atari_page,
+    "docs/results.md": results_page,
     "results/cartpole/README.md": cartpole_page,
     "results/classic/README.md": classic_page,
     "docs/performance.md": performance_page,

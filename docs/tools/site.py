@@ -19,6 +19,7 @@ OUTSIDE = {
     "contributing.md": "CONTRIBUTING.md",
     "changelog.md": "CHANGELOG.md",
     "examples.md": "examples/README.md",
+    "results/atari.md": "results/atari/README.md",
     "results/minatar.md": "results/minatar/README.md",
     "results/export.md": "results/export/README.md",
     "results/profile.md": "results/profile/README.md",

@@ -23,6 +23,7 @@ from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.files import file_name, json_text
 from switchmt_snn.runs.run import load_agent, train
 from switchmt_snn.study.grid import load_study
+from switchmt_snn.study.prize import best_split
 from switchmt_snn.study.statistics import (
     area_under_curve,
     forgetting,
@@ -61,6 +62,7 @@ EXAMPLES: tuple[Any, ...] = (
     makespan,
     file_name,
     meant,
+    best_split,
     json_text,
     make_environment,
     with_wrapper,
