@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -297,22 +298,22 @@ def exported_as(agent: Agent, folder: RunFolder, runtime: str, checkpoint: str) 
     Raises:
         ExportError: an unknown runtime; the run was not exported, or its files are of another training step.
     """
-    played = _runtime(folder, runtime, agent.suite, agent.config)
+    played = _runtime(folder, runtime, agent.suite, agent.config, checkpoint)
     if played.step != agent.step:
         raise ExportError(
             f"the exported files are of step {played.step}, expected {agent.step} (the {checkpoint} checkpoint); "
-            f"run switchmt-snn export {folder.path} again"
+            f"export it: {_export_command(folder, checkpoint)}"
         )
     return played
 
 
-def step_session(folder: RunFolder) -> onnxruntime.InferenceSession:
+def step_session(folder: RunFolder, checkpoint: str = "last") -> onnxruntime.InferenceSession:
     """``step.onnx`` of a run: one simulation step, with its spikes.
 
     Raises:
         ExportError: the run was not exported.
     """
-    return onnx_session(_exported(folder, "step.onnx", "--onnx"))
+    return onnx_session(_exported(folder, "step.onnx", "--onnx", checkpoint))
 
 
 def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads: int = 1) -> OnnxAgent | NirAgent:
@@ -337,35 +338,46 @@ def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads:
     """
     folder = open_run(run)
     config = folder.config()
-    return _runtime(folder, runtime, make_suite(config.tasks), config, threads)
+    return _runtime(folder, runtime, make_suite(config.tasks), config, "last", threads)
 
 
 def _runtime(
-    folder: RunFolder, runtime: str, suite: TaskSuite, config: ExperimentConfig, threads: int = 1
+    folder: RunFolder, runtime: str, suite: TaskSuite, config: ExperimentConfig, checkpoint: str, threads: int = 1
 ) -> OnnxAgent | NirAgent:
     if runtime == "onnx":
-        return OnnxAgent(_exported(folder, "decision.onnx", "--onnx"), suite, config, threads)
+        return OnnxAgent(_exported(folder, "decision.onnx", "--onnx", checkpoint), suite, config, threads)
     if runtime != "nir":
         raise ExportError(f"the runtime is {runtime!r}, expected onnx or nir")
-    paths = {name: _exported_nir(folder, name) for name in suite.names}
+    paths = {name: _exported_nir(folder, name, checkpoint) for name in suite.names}
     return NirAgent({name: read_nir(path) for name, path in paths.items()}, suite, config)
 
 
-def _exported_nir(folder: RunFolder, task: str) -> Path:
+def _exported_nir(folder: RunFolder, task: str, checkpoint: str) -> Path:
     """The task's NIR file, also under the name that version 0.1.0 gave to a task with a slash."""
     old_name = re.sub(r"[^A-Za-z0-9_.-]", "_", task) + ".nir"
     is_old = old_name != f"{file_name(task)}.nir" and (folder.path / "export" / old_name).is_file()
-    return _exported(folder, old_name if is_old else f"{file_name(task)}.nir", "--nir")
+    return _exported(folder, old_name if is_old else f"{file_name(task)}.nir", "--nir", checkpoint)
 
 
-def _exported(folder: RunFolder, name: str, flag: str) -> Path:
+def _export_command(folder: RunFolder, checkpoint: str, *flags: str) -> str:
+    chosen = () if checkpoint == "last" else ("--checkpoint", checkpoint)
+    return shlex.join(["switchmt-snn", "export", str(folder.path), *flags, *chosen])
+
+
+def _exported(folder: RunFolder, name: str, flag: str, checkpoint: str) -> Path:
     """A file of the run's export, as it was when it was compared with the network.
+
+    Args:
+        folder: of the run.
+        name: of the file.
+        flag: of ``export`` that writes it.
+        checkpoint: whose weights are asked for.
 
     Raises:
         ExportError: it is missing, was not compared, or has changed since.
     """
     path = folder.path / "export" / name
-    again = f"run switchmt-snn export {folder.path} {flag}"
+    again = f"export it: {_export_command(folder, checkpoint, flag)}"
     if not path.is_file():
         raise ExportError(f"no {path}, expected an exported run; {again}")
     beside = path.with_name("parity.json")

@@ -87,7 +87,7 @@ def watched_agent(run: str | Path | None = None, runtime: str = "torch", checkpo
     played, network = exported_as(agent, folder, runtime, checkpoint), fold_agent(agent)
     if isinstance(played, NirAgent):
         return Watched(agent, lambda agent: tracer_of_nir(agent, network, played), runtime)
-    step = step_session(folder) if network.spiking else None
+    step = step_session(folder, checkpoint) if network.spiking else None
     return Watched(agent, lambda agent: tracer_of_onnx(agent, network, played, step), runtime)
 
 

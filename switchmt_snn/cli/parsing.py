@@ -232,16 +232,27 @@ def for_another_suite(
         argv: the flags.
         command: its name.
     """
-    source, suite, names = source or "quickstart", config.tasks.suite, config.tasks.names
+    source, suite = source or "quickstart", config.tasks.suite
     if suite == default.tasks.suite or source not in presets():
         return None
     told = f"note: the settings of the preset {source} are for the suite {default.tasks.suite}, not for {suite}; "
-    made_for = [name for name in presets() if load_config(name).tasks.suite == suite]
+    made_for = presets_for(suite)
     if not made_for:
         return f"{told}no preset is for that suite, so write a config of your own (docs/configuration.md)"
-    nearest = min(made_for, key=lambda name: abs(len(load_config(name).tasks.names) - len(names)))
+    nearest = nearest_preset(config) or source
     again = shlex.join(["switchmt-snn", command, nearest, *_without(argv, "--run")])
     return f"{told}presets for that suite: {', '.join(made_for)}. Try: {runnable(again)}"
+
+
+def presets_for(suite: str) -> list[str]:
+    """Names of the presets whose tasks are of a suite."""
+    return [name for name in presets() if load_config(name).tasks.suite == suite]
+
+
+def nearest_preset(config: ExperimentConfig) -> str | None:
+    """The preset for a config's suite whose number of tasks is the nearest; None if none is for that suite."""
+    made_for, count = presets_for(config.tasks.suite), len(config.tasks.names)
+    return min(made_for, key=lambda name: abs(len(load_config(name).tasks.names) - count), default=None)
 
 
 RENAMED = {"evaluate": {"--engine": "--runtime"}, "export": {"--nir-profile": "--nir-dialect"}}

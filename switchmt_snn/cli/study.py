@@ -159,7 +159,7 @@ def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOpti
         _report(console, study, folder, options.json)
     finally:
         lock.release()
-    _say_how_to_go_on(console, folder, stopped, [trial.name for trial in failed])
+    _say_how_to_go_on(console, how_to_go_on(folder.path, options), stopped, [trial.name for trial in failed])
     return 130 if stopped else 1 if failed else 0
 
 
@@ -175,8 +175,17 @@ def _engine(options: StudyOptions) -> Engine:
     raise ConfigError(f"--engine is {options.engine!r}, expected local or ray")
 
 
-def _say_how_to_go_on(console: Console, folder: StudyFolder, stopped: bool, failed: list[str]) -> None:
-    again = f"{program()} study {shlex.quote(str(folder.path))}"
+def how_to_go_on(path: Path, options: StudyOptions) -> str:
+    """The command that continues a study in a folder, where and as wide as it was asked for."""
+    words = ["study", str(path)]
+    for name in ("jobs", "engine", "address", "gpus_per_trial"):
+        value = getattr(options, name)
+        if value != getattr(StudyOptions, name):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return f"{program()} {shlex.join(words)}"
+
+
+def _say_how_to_go_on(console: Console, again: str, stopped: bool, failed: list[str]) -> None:
     if failed:
         console.print(f"failed: {', '.join(failed)}; try them again with: {again}", highlight=False, soft_wrap=True)
     elif stopped:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, peek, split_one
+from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, nearest_preset, parse, peek, split_one
 from switchmt_snn.config import ExperimentConfig, load_config, resolve, to_yaml
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.machine.program import program, runnable
@@ -17,6 +18,8 @@ from switchmt_snn.viewing import output
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from switchmt_snn.runs.run import RunResult
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,10 @@ def command(argv: list[str]) -> int:
     if source is None and options.run is not None:
         from switchmt_snn.runs.folder import RunFolder
 
-        RunFolder(options.run).require()  # a wrong name must not begin a run of quickstart there
+        asked = options.experiment
+        preset = "quickstart" if asked.tasks.suite == default.tasks.suite else nearest_preset(asked) or "quickstart"
+        again = shlex.join(["switchmt-snn", "train", preset, *rest])
+        RunFolder(options.run).require(again)  # a wrong name must not begin a run of quickstart there
     config = resolve(options.experiment)
     if options.print_config:
         print(to_yaml(config, options.experiment), end="")
@@ -60,18 +66,18 @@ def command(argv: list[str]) -> int:
     if options.json:
         scores = None if result.evaluation is None else result.evaluation.to_dict()
         output.print_json({"run": str(result.path), "status": result.status, "step": result.step, "evaluation": scores})
-    again = f"{program()} train --run {shlex.quote(str(result.path))}"
     if result.status == "stopped":
+        again = f"{launcher()} train --run {shlex.quote(str(result.path))}"
         console.print(f"stopped at step {result.step:,}; continue exactly here with: {again}", soft_wrap=True)
     elif result.status == "already_finished":
+        why = "evaluation.stop_at_returns is reached; begin another run" if result.solved else "raise the budget"
         console.print(
-            f"already finished at step {result.step:,}; raise the budget to go on: {again} --total-steps "
-            f"{2 * config.total_steps}",
+            f"already finished at step {result.step:,}; {why} to go on: {_how_to_go_on(config, result)}",
             soft_wrap=True,
         )
     elif result.evaluation is not None:
         console.print(evaluation_table(result.evaluation))
-        _say_what_next(console, config, result.path, result.step)
+        _say_what_next(console, config, result)
     # A run that was killed after its last evaluation has no page yet.
     if result.status != "already_finished" or not (result.path / "report.html").is_file():
         _write_report(console, result.path)
@@ -80,11 +86,27 @@ def command(argv: list[str]) -> int:
     return 130 if result.status == "stopped" else 0
 
 
-def _say_what_next(console: Console, config: ExperimentConfig, path: Path, step: int) -> None:
+def launcher() -> str:
+    """What begins a training as this one was begun: under ``torchrun`` with as many processes."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return program()
+    return f"torchrun --nproc-per-node {os.environ['LOCAL_WORLD_SIZE']} -m -- switchmt_snn"
+
+
+def _how_to_go_on(config: ExperimentConfig, result: RunResult) -> str:
+    """The command that trains a finished run further; a run that reached its goal is the start of another one."""
+    run = shlex.quote(str(result.path))
+    if not result.solved:
+        return f"{launcher()} train --run {run} --total-steps {2 * config.total_steps}"
+    config_file = shlex.quote(str(result.path / "config.yaml"))
+    return f"{launcher()} train {config_file} --initial-weights {run} --evaluation.stop-at-returns"
+
+
+def _say_what_next(console: Console, config: ExperimentConfig, result: RunResult) -> None:
     from switchmt_snn.runs.folder import RunFolder
     from switchmt_snn.tasks.registry import find_suite
 
-    lines = []
+    lines, path, step = [], result.path, result.step
     needed = find_suite(config.tasks.suite).steps_to_learn
     if needed is not None and config.total_steps < needed:
         lines.append(
@@ -102,7 +124,7 @@ def _say_what_next(console: Console, config: ExperimentConfig, path: Path, step:
         *([f"  switchmt-snn evaluate {run} --episodes 30 --checkpoint best"] if best and best.step != step else []),
         f"  switchmt-snn export {run}",
         f"  switchmt-snn profile {run}",
-        f"  switchmt-snn train --run {run} --total-steps {2 * config.total_steps}",
+        f"  {_how_to_go_on(config, result)}",
         f"  switchmt-snn describe {shlex.quote(str(path / 'config.yaml'))}",
     ]
     for line in lines:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -230,6 +231,11 @@ class CheckpointStore:
 
     # Reading
 
+    @property
+    def _train_first(self) -> str:
+        """What to do where there is none."""
+        return f"train first: switchmt-snn train --run {shlex.quote(str(self.folder.parent))}"
+
     def paths(self) -> list[Path]:
         """Checkpoint folders, newest first."""
         return sorted((path for path in self.folder.glob("step-*") if path.is_dir()), reverse=True)
@@ -253,7 +259,7 @@ class CheckpointStore:
                 f"no whole checkpoint in {self.folder}: {'; '.join(damaged)}; expected at least one; "
                 "start again in another folder with --run"
             )
-        raise CheckpointError(f"no checkpoint in {self.folder}, expected one; run switchmt-snn train first")
+        raise CheckpointError(f"no checkpoint in {self.folder}, expected one; {self._train_first}")
 
     def _load_one(self, path: Path, replays: list[FrameReplay], damaged: tuple[str, ...]) -> LoadedCheckpoint:
         manifest = read_manifest(path)
@@ -322,7 +328,7 @@ class CheckpointStore:
         if which not in ("last", "best"):
             raise CheckpointError(f"the checkpoint is {which!r}, expected last or best")
         paths = [self.folder / "best"] if which == "best" else self.paths()
-        seen, remedy = "none", "run switchmt-snn train first"
+        seen, remedy = "none", self._train_first
         if paths:
             try:
                 manifest = read_manifest(paths[0])

@@ -126,14 +126,17 @@ class RunFolder:
         unfinished = {name for name in names if name.startswith((".config.yaml.", ".environment.json.")) and made}
         return sorted(names - begun - unfinished)
 
-    def require(self) -> RunFolder:
+    def require(self, begin: str | None = None) -> RunFolder:
         """This folder, if it is a run.
+
+        Args:
+            begin: the command that begins a run here, for the error; None for the shortest.
 
         Raises:
             RunFolderError: it does not exist, is empty, or holds something else.
         """
         if self._is_free:
-            begin = f"switchmt-snn train quickstart --run {shlex.quote(str(self.path))}"
+            begin = begin or f"switchmt-snn train quickstart --run {shlex.quote(str(self.path))}"
             beside = [path.parent.name for path in self.path.parent.glob("*/environment.json")]
             raise RunFolderError(
                 f"no run folder {self.path}, expected one; a new run needs a config: {begin}"
@@ -296,5 +299,6 @@ def check_same_config(stored: ExperimentConfig, asked: ExperimentConfig, path: P
         shown = ", ".join(f"{key} ({old!r} -> {new!r})" for key, (old, new) in sorted(changed.items()))
         raise ConfigError(
             f"{path} holds a run of another config: {shown}; expected the same config (total_steps may be raised); "
-            "name another folder with --run, or continue it with: switchmt-snn train --run " + str(path)
+            "name another folder with --run, or continue it with: switchmt-snn train --run "
+            f"{shlex.quote(str(path))}"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,8 @@ def read_initial_weights(config: ExperimentConfig, suite: TaskSuite, folder: Pat
         shown = ", ".join(f"{key} ({old!r} -> {new!r})" for key, (old, new) in sorted(changed.items()))
         raise ConfigError(
             f"initial_weights is {run}, a run with other settings: {shown}; expected the same tasks and the same "
-            f"network; begin with its config: switchmt-snn train {source.path / 'config.yaml'} --initial-weights {run}"
+            f"network; begin with its config: switchmt-snn train {shlex.quote(str(source.path / 'config.yaml'))} "
+            f"--initial-weights {shlex.quote(run)}"
         )
     step, weights = source.checkpoints().load_model()
     found = InitialWeights(run, step, weights)

@@ -170,7 +170,11 @@ def _energy_lines(profile: Mapping[str, Any] | None, spiking: bool) -> list[str]
     lines = ["## Energy", ""]
     if profile is None:
         counted = "spikes" if spiking else "operations"
-        return [*lines, f"Not profiled at this step; `switchmt-snn profile` counts {counted} and estimates energy.", ""]
+        return [
+            *lines,
+            f"Not profiled at this step; `switchmt-snn profile RUN` counts {counted} and estimates energy.",
+            "",
+        ]
     lines += [
         f"Estimates from exact counts on recorded play ({profile['tool']}), not measurements of a chip. "
         f"{profile['headline']}",
@@ -206,7 +210,9 @@ def _limits(
     if parity is not None and parity["weights"] == "int8":
         lines.append("The scores are those of the float32 weights, not of these 8-bit ones.")
     elif parity is not None:
-        lines.append("The scores are the trained network's; `switchmt-snn evaluate --runtime` plays these files.")
+        lines.append(
+            "The scores are the trained network's; `switchmt-snn evaluate RUN --runtime onnx` plays the files."
+        )
     for task in profile["tasks"] if profile is not None else ():
         for effect in task.get("precision", ()):
             lines.append(

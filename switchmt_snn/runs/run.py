@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -63,12 +64,14 @@ class RunResult:
         status: ``finished``, ``stopped`` (by a signal; the same command continues), ``already_finished``, or ``served``
             (one of the other processes of ``torchrun``).
         evaluation: the final evaluation of a run that finished.
+        solved: ``evaluation.stop_at_returns`` ended it; a larger budget changes nothing.
     """
 
     path: Path
     status: str
     step: int
     evaluation: Evaluation | None
+    solved: bool = False
 
 
 def train(
@@ -218,14 +221,14 @@ class _Driver:
             self.solved = self._is_solved(self.folder.evaluations.mean_returns(resumed_at, config.evaluation))
         at_its_end = self.solved or training.steps >= config.total_steps
         if at_its_end and self.folder.evaluations.mean_returns(training.steps, self._final_evaluation()):
-            return RunResult(self.folder.path, "already_finished", training.steps, None)
+            return RunResult(self.folder.path, "already_finished", training.steps, None, self.solved)
         try:
             return self._run(log_sizes, resumed_at, [*self.notes, *notes])
         except OSError as error:
             raise TrainingFailed(
                 f"writing to {self.folder.path} failed at step {training.steps} ({error.strerror or error}), expected "
                 "a disk with room; the last whole checkpoint is kept: make room and run the same command with "
-                f"--run {self.folder.path}"
+                f"--run {shlex.quote(str(self.folder.path))}"
             ) from error
 
     def _run(self, log_sizes: dict[str, int] | None, resumed_at: int | None, notes: list[str]) -> RunResult:
@@ -261,7 +264,7 @@ class _Driver:
             logs.close()
         if stopped:
             return RunResult(path, "stopped", training.steps, None)
-        return RunResult(path, "finished", training.steps, self._evaluate(self._final_evaluation()))
+        return RunResult(path, "finished", training.steps, self._evaluate(self._final_evaluation()), self.solved)
 
     def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
         """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""

@@ -234,9 +234,13 @@ def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypat
         (
             ["train", "--run", "runs/typo", "--total-steps", "100"],
             "no run folder runs/typo, expected one; a new run needs a config: "
-            "switchmt-snn train quickstart --run runs/typo",
+            "switchmt-snn train quickstart --run runs/typo --total-steps 100\n",
         ),
         (["train", "--run=runs/typo", "--print-config"], "no run folder runs/typo"),
+        (
+            ["train", "--tasks.suite", "gym", "--tasks.names", "A-v0", "B-v0", "--run", "runs/my typo"],
+            "switchmt-snn train classic --tasks.suite gym --tasks.names A-v0 B-v0 --run 'runs/my typo'\n",
+        ),
         (["export", "runs/my typo"], "switchmt-snn train quickstart --run 'runs/my typo'"),
         (["describe", "--network.trunk", "minatar", "--tasks.names", "nope"], "unknown atari task"),
     ],

@@ -20,7 +20,8 @@ from switchmt_snn.cli import main
 from switchmt_snn.cli.evaluate import EvaluateOptions
 from switchmt_snn.cli.export import ExportOptions
 from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, split, split_one
-from switchmt_snn.cli.train import TrainOptions
+from switchmt_snn.cli.study import StudyOptions, how_to_go_on
+from switchmt_snn.cli.train import TrainOptions, launcher
 from switchmt_snn.config import ExperimentConfig, from_dict, load_config, presets
 from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
@@ -272,3 +273,18 @@ def test_a_table_of_parity_speaks_of_spikes_where_there_are_some(spiking: bool) 
     text = stream.getvalue()
     assert ("spike" in text) == ("flips:" in text) == spiking
     assert "every Q-value" in text
+
+
+def test_a_study_is_continued_as_it_was_begun() -> None:
+    assert how_to_go_on(Path("my study"), StudyOptions()) == "switchmt-snn study 'my study'"
+    options = StudyOptions(jobs=2, engine="ray", address="host:6379", gpus_per_trial=0.5, seeds=(1, 2))
+    assert how_to_go_on(Path("s"), options) == (
+        "switchmt-snn study s --jobs 2 --engine ray --address host:6379 --gpus-per-trial 0.5"
+    )
+
+
+def test_a_training_is_continued_by_as_many_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert launcher() == "switchmt-snn"
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert launcher() == "torchrun --nproc-per-node 2 -m -- switchmt_snn"

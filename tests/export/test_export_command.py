@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from switchmt_snn.errors import ExportError
 from switchmt_snn.export import ExportSettings, export, export_run
+from switchmt_snn.runs.folder import RunFolder
 from tests.export.export_cases import RunCommand
 
 
@@ -101,7 +103,7 @@ def test_wrong_use_is_one_line(trained_run: Path, tmp_path: Path, run_command: R
         assert message in err
         assert len(err.strip().splitlines()) == 1, err
     _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
-    assert f"run switchmt-snn export {trained_run} --onnx" in err
+    assert f"export it: switchmt-snn export {trained_run} --onnx\n" in err
     run_command("export", trained_run, "--onnx", "--parity-decisions", 20)
     (trained_run / "export" / "decision.onnx").write_bytes(b"damaged")
     _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
@@ -117,6 +119,13 @@ def test_an_export_of_an_older_step_does_not_pass_for_the_newer_one(trained_run:
     run_command("train", "--run", trained_run, "--total-steps", 620)
     _, err = run_command("evaluate", trained_run, "--runtime", "onnx", code=2)
     assert "of step 600, expected 620" in err
+    assert err.endswith(f"export it: switchmt-snn export {trained_run}\n")
+
+
+def test_the_export_that_an_error_asks_for_has_the_checkpoint_that_is_played(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "a run")
+    with pytest.raises(ExportError, match=rf"export it: switchmt-snn export '{run.path}' --onnx --checkpoint best$"):
+        export_run.step_session(run, "best")
 
 
 @pytest.mark.slow

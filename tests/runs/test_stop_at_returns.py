@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from switchmt_snn import train
+from switchmt_snn.cli.entry import main
 from switchmt_snn.config import ExperimentConfig, from_dict
 from switchmt_snn.errors import ConfigError
 
@@ -47,7 +49,27 @@ def test_training_ends_at_the_first_evaluation_that_reaches_every_goal(tmp_path:
     assert result.evaluation.protocol.seed == 10_001
     assert evaluations(tmp_path / "run") == {100: [10_000, 10_001]}
     again = train(config, tmp_path / "run")
-    assert (again.status, again.step) == ("already_finished", 100)
+    assert (again.status, again.step, again.solved) == ("already_finished", 100, True)
+
+
+@pytest.mark.slow
+def test_the_command_that_trains_a_solved_run_further_does_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A larger budget would not: the goal stays reached."""
+    monkeypatch.chdir(tmp_path)
+    train(cartpole_and_car([5.0, -200.0], total_steps=120), tmp_path / "my run")
+    with pytest.raises(SystemExit):
+        main(["train", "--run", "my run"])
+    said = capsys.readouterr().out
+    assert "already finished at step 100; evaluation.stop_at_returns is reached; begin another run to go on: " in said
+    command = shlex.split(said.splitlines()[0].partition(" to go on: ")[2])
+    assert command[0] == "switchmt-snn"
+    with pytest.raises(SystemExit):
+        main(command[1:])
+    said = capsys.readouterr().out
+    assert "begins with the weights of my run after 100 steps" in " ".join(said.split())
+    assert "Scores at step 120" in said
 
 
 @pytest.mark.slow

@@ -204,8 +204,10 @@ def test_a_run_without_any_episode_has_a_page(tmp_path: Path) -> None:
         shutil.copy(LAGGING / name, tmp_path)
     page, facts = written(write_report([tmp_path]))
     assert facts["steps"] == 0
-    assert "Not evaluated yet" in "".join(page.text)
-    assert "No episode has ended yet" in "".join(page.text)
+    text = "".join(page.text)
+    assert f"Not evaluated yet: switchmt-snn evaluate {tmp_path}" in text
+    assert f"Make more with switchmt-snn profile {tmp_path} (" in text
+    assert "No episode has ended yet" in text
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -60,15 +61,17 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None, figu
     if len(read) == 1:
         sections = figures_of(read[0])
         facts = run_facts(read[0], sections, folder)
+        run = shlex.quote(str(read[0].folder.path))
         charts = [one for ones in sections.values() for one in ones]
         name, drawn = "report", sections
     else:
         groups, differing = grouped(read)
         compared = comparison_figures(groups)
         facts = comparison_facts(groups, differing, compared)
+        run = None
         charts = list(compared)
         name, drawn = "comparison", {"learning": charts}
-    page = _rendered(f"{name}.html.jinja", facts, drawn)
+    page = _rendered(f"{name}.html.jinja", facts, drawn, run)
     figure_folder = "figures" if name == "report" else "comparison_figures"
     return _write(folder, name, page, facts, charts if figures else [], figure_folder)
 
@@ -141,12 +144,15 @@ def _write_figures(folder: Path, charts: Sequence[Chart | Timeline]) -> None:
             progress.advance()
 
 
-def _rendered(template: str, facts: dict[str, Any], drawn: dict[str, list[Chart | Timeline]]) -> str:
+def _rendered(
+    template: str, facts: dict[str, Any], drawn: dict[str, list[Chart | Timeline]], run: str | None = None
+) -> str:
+    """The page; ``run`` is the folder as commands take it."""
     environment = page_environment("switchmt_snn.viewing.report")
     environment.filters |= {"duration": duration, "compact": compact}
     environment.globals |= {"picture": _picture, "colour": series_colour, "beyond": _beyond}
     folded = [one.name for one in drawn.get("layers", ()) if one.name.startswith("saturated")]
-    return environment.get_template(template).render(facts=facts, drawn=drawn, folded=folded)
+    return environment.get_template(template).render(facts=facts, drawn=drawn, folded=folded, run=run)
 
 
 def _picture(figure: Chart | Timeline) -> Markup:
