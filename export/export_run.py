@@ -327,7 +327,7 @@ def load_exported(run: str | Path | None = None, runtime: str = "onnx", threads:
     Raises:
         ExportError: an unknown runtime, or the run was not exported.
 
-    Example:
+    Examples:
         >>> import numpy as np
         >>> from switchmt_snn.export import ExportSettings, export, load_exported
         >>> exported = export("runs/mine", ExportSettings(onnx=True, parity_decisions=8))

@@ -49,7 +49,7 @@ def to_onnx(
         ExportError: an ANN has no step and nothing to unroll, or a weight is not finite.
         TaskError: unknown task.
 
-    Example:
+    Examples:
         >>> from switchmt_snn.export import to_onnx
         >>> model = to_onnx("runs/mine")
         >>> [value.name for value in model.graph.input]
@@ -77,7 +77,7 @@ def to_nir(source: Source, task: str, dialect: NirDialect = "portable", int8: bo
         ExportError: the dialect cannot express the network exactly; the message names one that can.
         TaskError: unknown task.
 
-    Example:
+    Examples:
         >>> from switchmt_snn.export import to_nir
         >>> graph = to_nir("runs/mine", task="CartPole-v1")
         >>> type(graph.nodes["input"]).__name__, int(graph.metadata["timesteps"])

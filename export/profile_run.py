@@ -84,7 +84,7 @@ def profile(
         ConfigError: fewer than one decision, or a target or chip that does not exist or is wrong.
         ExportError: recorded play that cannot be read or does not fit, or a weight that is not finite.
 
-    Example:
+    Examples:
         >>> from switchmt_snn.export import profile
         >>> counted = profile("runs/mine", decisions=8, targets=["cmos45-fp32"])
         >>> [task["task"] for task in counted.facts["tasks"]]

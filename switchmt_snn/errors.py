@@ -63,9 +63,10 @@ class TrainingFailed(SwitchMTError):
 def shown(value: object) -> str:
     """What code from outside gave, for an error: its repr on one line, or type and shape of a larger array.
 
-    >>> import numpy
-    >>> shown(numpy.zeros((2, 84, 84)))
-    'a float64 ndarray of shape (2, 84, 84)'
+    Examples:
+        >>> import numpy
+        >>> shown(numpy.zeros((2, 84, 84)))
+        'a float64 ndarray of shape (2, 84, 84)'
     """
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if isinstance(shape, tuple) and dtype is not None and math.prod(shape) > _LARGEST_SHOWN:
@@ -77,8 +78,9 @@ def shown(value: object) -> str:
 def printable(text: object) -> str:
     """A text as it may reach a terminal: on one line, without control characters, of at most 500 characters.
 
-    >>> printable("a\\x1b[2J")
-    'a\\\\x1b[2J'
+    Examples:
+        >>> printable("a\\x1b[2J")
+        'a\\\\x1b[2J'
     """
     shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in str(text)[:501])
     return shown if len(shown) <= 500 else shown[:497] + "..."

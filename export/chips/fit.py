@@ -180,7 +180,7 @@ def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
     Raises:
         ConfigError: no such chip, or a file that is not one.
 
-    Example:
+    Examples:
         >>> from switchmt_snn.export.folded import fold_agent
         >>> from switchmt_snn.runs.run import load_agent
         >>> layers = layer_shapes(fold_agent(load_agent("runs/mine")))

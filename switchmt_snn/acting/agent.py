@@ -95,7 +95,7 @@ class Agent:
         That is the index of the largest Q-value (see ``q_values``), plus the ``start`` of the environment's
         ``Discrete`` space (``suite.first_actions``).
 
-        Example:
+        Examples:
             >>> import numpy as np
             >>> from switchmt_snn import load_agent
             >>> agent = load_agent("runs/mine")  # the run of train's example

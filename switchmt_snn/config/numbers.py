@@ -10,8 +10,9 @@ _EXACT_INTEGERS = 2.0**53
 def exact(value: float) -> str:
     """The shortest text that reads back as this float; a whole number without its ``.0``.
 
-    >>> exact(1234567.0), exact(0.1), exact(-0.5)
-    ('1234567', '0.1', '-0.5')
+    Examples:
+        >>> exact(1234567.0), exact(0.1), exact(-0.5)
+        ('1234567', '0.1', '-0.5')
     """
     value = float(value)
     return str(int(value)) if value.is_integer() and abs(value) < _EXACT_INTEGERS else repr(value)
@@ -23,8 +24,9 @@ def whole_number(text: str) -> int:
     Raises:
         ValueError: the text is no number, or not a whole one.
 
-    >>> whole_number("1e6"), whole_number("12_000")
-    (1000000, 12000)
+    Examples:
+        >>> whole_number("1e6"), whole_number("12_000")
+        (1000000, 12000)
     """
     try:
         return int(text)

@@ -60,10 +60,11 @@ def meant(seen: str, known: Iterable[str]) -> list[str]:
         seen: the unknown name, with its sections: ``learning.lr``.
         known: the names that there are, in the same spelling.
 
-    >>> meant("lr", ["total_steps", "learning.learning_rate"])
-    ['learning.learning_rate']
-    >>> meant("batch_size", ["learning.batch_size", "tasks.num_envs"])
-    ['learning.batch_size']
+    Examples:
+        >>> meant("lr", ["total_steps", "learning.learning_rate"])
+        ['learning.learning_rate']
+        >>> meant("batch_size", ["learning.batch_size", "tasks.num_envs"])
+        ['learning.batch_size']
     """
     names = sorted(known)
     last = seen.rpartition(".")[2]

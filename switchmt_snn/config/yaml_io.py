@@ -33,7 +33,7 @@ def load_config(
     Raises:
         ConfigError: no such file or preset, not YAML, or a key or value that the config does not take.
 
-    Example:
+    Examples:
         >>> config = load_config("minatar")
         >>> config.tasks.names, config.total_steps
         (('breakout', 'asterix', 'space_invaders'), 600000)

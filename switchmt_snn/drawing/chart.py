@@ -161,8 +161,9 @@ def _data_range(chart: Chart) -> tuple[float, float]:
 def ticks(low: float, high: float, wanted: int = 5) -> list[float]:
     """Round numbers within a range.
 
-    >>> ticks(0.0, 10.0), ticks(-21.0, -18.0, 3)
-    ([0.0, 2.0, 4.0, 6.0, 8.0, 10.0], [-21.0, -20.0, -19.0, -18.0])
+    Examples:
+        >>> ticks(0.0, 10.0), ticks(-21.0, -18.0, 3)
+        ([0.0, 2.0, 4.0, 6.0, 8.0, 10.0], [-21.0, -20.0, -19.0, -18.0])
     """
     rough = (high - low) / max(1, wanted)
     unit = 10.0 ** math.floor(math.log10(rough))

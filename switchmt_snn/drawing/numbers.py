@@ -32,8 +32,9 @@ def two(value: float) -> str:
 def compact(value: float) -> str:
     """A number at an axis: thousands as k, millions as M.
 
-    >>> compact(1_500_000.0), compact(20_000.0), compact(-0.25), compact(950.0)
-    ('1.5M', '20k', '-0.25', '950')
+    Examples:
+        >>> compact(1_500_000.0), compact(20_000.0), compact(-0.25), compact(950.0)
+        ('1.5M', '20k', '-0.25', '950')
     """
     for unit, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= unit * (10 if letter == "k" else 1):
@@ -44,8 +45,9 @@ def compact(value: float) -> str:
 def scaled(value: float, unit: str) -> str:
     """Three significant digits in the unit that fits, from pico to the unit itself.
 
-    >>> scaled(0.00783, "J"), scaled(1.47e-6, "J"), scaled(15.6, "J")
-    ('7.83 mJ', '1.47 µJ', '15.6 J')
+    Examples:
+        >>> scaled(0.00783, "J"), scaled(1.47e-6, "J"), scaled(15.6, "J")
+        ('7.83 mJ', '1.47 µJ', '15.6 J')
     """
     prefixes = (("", 1.0), ("m", 1e-3), ("µ", 1e-6), ("n", 1e-9), ("p", 1e-12))
     prefix, factor = next((one for one in prefixes if abs(value) >= 0.9995 * one[1]), prefixes[-1])
@@ -55,8 +57,9 @@ def scaled(value: float, unit: str) -> str:
 def bytes_of(value: float) -> str:
     """Bytes in the unit that fits.
 
-    >>> bytes_of(512), bytes_of(3_500_000)
-    ('512 B', '3.3 MiB')
+    Examples:
+        >>> bytes_of(512), bytes_of(3_500_000)
+        ('512 B', '3.3 MiB')
     """
     size, units = float(value), ["B", "KiB", "MiB", "GiB", "TiB"]
     while size >= 1024 and len(units) > 1:
@@ -68,8 +71,9 @@ def bytes_of(value: float) -> str:
 def duration(seconds: float) -> str:
     """Hours, minutes and seconds; days in front if there are any.
 
-    >>> duration(3_725.4), duration(428_400)
-    ('01:02:05', '4 d 23:00:00')
+    Examples:
+        >>> duration(3_725.4), duration(428_400)
+        ('01:02:05', '4 d 23:00:00')
     """
     days, rest = divmod(max(0, int(seconds)), 86_400)
     clock = f"{rest // 3600:02}:{rest // 60 % 60:02}:{rest % 60:02}"

@@ -90,7 +90,7 @@ class FrameReplay:
     Attributes:
         transitions_added: transitions ever added.
 
-    Example:
+    Examples:
         >>> replay = FrameReplay(capacity_steps=100, num_lanes=1, frame_shape=(2,), dtype=np.float32, stack=1)
         >>> replay.begin(0, np.array([0.0, 0.0], np.float32))
         >>> replay.add(0, action=1, reward=0.5, terminated=False, next_frame=np.array([1.0, 2.0], np.float32))

@@ -25,10 +25,11 @@ def file_name(*tasks: str) -> str:
     A plain name stays as it is. Another one (``ALE/Pong-v5``, ``my_module:MyEnv-v0``) keeps its plain characters and
     gets ``~`` and 16 digits of its SHA-256; ``~`` and ``+``, which joins several tasks, are in no plain name.
 
-    >>> file_name("breakout", "pong")
-    'breakout+pong'
-    >>> file_name("my_module:MyEnv-v0")
-    'my_module_MyEnv-v0~8e46a734f0f6d4fa'
+    Examples:
+        >>> file_name("breakout", "pong")
+        'breakout+pong'
+        >>> file_name("my_module:MyEnv-v0")
+        'my_module_MyEnv-v0~8e46a734f0f6d4fa'
     """
     joined = "+".join(map(_one_name, tasks))
     return joined if len(joined) <= _LONGEST_LIST else _marked(joined, repr(tasks))
@@ -45,8 +46,9 @@ def _marked(text: str, hashed: str) -> str:
 def json_text(value: Any, indent: int | None = None) -> str:
     """Plain values as JSON (RFC 8259). It has no NaN and no infinity: a number that is not finite becomes null.
 
-    >>> json_text({"q": [1.5, float("nan")]})
-    '{"q": [1.5, null]}'
+    Examples:
+        >>> json_text({"q": [1.5, float("nan")]})
+        '{"q": [1.5, null]}'
     """
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 

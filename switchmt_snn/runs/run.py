@@ -97,7 +97,7 @@ def train(
     Raises:
         SwitchMTError: wrong use (``exit_code`` 2), or a run that failed (``exit_code`` 1).
 
-    Example:
+    Examples:
         >>> from dataclasses import replace
         >>> from switchmt_snn import load_config, train
         >>> config = load_config("quickstart")
@@ -381,7 +381,7 @@ def load_agent(
         RunFolderError: no such run.
         CheckpointError: no whole checkpoint.
 
-    Example:
+    Examples:
         A loop of one's own; ``Agent.environment`` plays a task exactly as training does.
 
         >>> from switchmt_snn import load_agent

@@ -94,7 +94,7 @@ def load_study(source: str | Path, overrides: Sequence[str] = (), seeds: Sequenc
     Raises:
         ConfigError: no such file, or a key, value or name that it does not take; the line names it.
 
-    Example:
+    Examples:
         >>> from switchmt_snn.study.grid import load_study
         >>> study = load_study("policies_minatar", ["total_steps=2000"], seeds=[1, 2])
         >>> study.variants[0], study.trials[0].name, study.trials[0].config.total_steps

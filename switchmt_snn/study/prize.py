@@ -101,10 +101,11 @@ def best_split(curves: Sequence[TaskCurve], budget_steps: int, parts: int = 60) 
     A split is left out where a task would get more steps than its curve knows: nothing is extrapolated. A task whose
     curve cannot rise any more gets what is left over in the split that is found first.
 
-    >>> fast = TaskCurve(np.array([10.0, 90.0]), np.array([1.0, 1.0]), 0.0, 1.0)
-    >>> slow = TaskCurve(np.array([90.0]), np.array([0.9]), 0.0, 1.0)
-    >>> best_split([fast, slow], 100, parts=10).steps_K
-    (10, 90)
+    Examples:
+        >>> fast = TaskCurve(np.array([10.0, 90.0]), np.array([1.0, 1.0]), 0.0, 1.0)
+        >>> slow = TaskCurve(np.array([90.0]), np.array([0.9]), 0.0, 1.0)
+        >>> best_split([fast, slow], 100, parts=10).steps_K
+        (10, 90)
 
     Raises:
         ConfigError: no curve, or no split for which all curves are known.

@@ -47,8 +47,9 @@ class Interval:
 def interquartile_mean(scores_SK: npt.ArrayLike) -> Any:
     """Mean of the middle half of all S x K scores: ``floor(S K / 4)`` are left out at each end.
 
-    >>> float(interquartile_mean([[0.0, 1.0], [2.0, 30.0]]))
-    1.5
+    Examples:
+        >>> float(interquartile_mean([[0.0, 1.0], [2.0, 30.0]]))
+        1.5
 
     Raises:
         ConfigError: scores that are no finite numbers ``[..., S, K]``.
@@ -74,8 +75,9 @@ def probability_of_improvement(scores_SK: npt.ArrayLike, other_SK: npt.ArrayLike
     Per task, the share of the S x S' pairs of runs that the first wins (Mann-Whitney's U / (S S')); then the mean over
     tasks. Pairs are across all seeds, also when the seeds are paired.
 
-    >>> float(probability_of_improvement([[2.0], [3.0]], [[1.0], [2.0]]))
-    0.875
+    Examples:
+        >>> float(probability_of_improvement([[2.0], [3.0]], [[1.0], [2.0]]))
+        0.875
 
     Raises:
         ConfigError: scores that are no finite numbers ``[..., S, K]``, or another number of tasks.
@@ -148,8 +150,9 @@ def harmonic_mean_over_tasks(shares_SK: npt.ArrayLike) -> Any:
 
     Give it ``share_of_reference``. A method that gives up one task loses more than it can win on the others.
 
-    >>> float(harmonic_mean_over_tasks([[1.0, 0.5, 0.25]])[0])
-    0.42857142857142855
+    Examples:
+        >>> float(harmonic_mean_over_tasks([[1.0, 0.5, 0.25]])[0])
+        0.42857142857142855
 
     Raises:
         ConfigError: shares that are no finite numbers ``[..., S, K]``.
@@ -166,8 +169,9 @@ def area_under_curve(steps_N: Sequence[float] | Array, scores_N: npt.ArrayLike) 
         steps_N: step of each evaluation, rising; N at least 2.
         scores_N: ``[..., N]``.
 
-    >>> float(area_under_curve([0, 10, 30], [0.0, 1.0, 1.0]))
-    0.8333333333333334
+    Examples:
+        >>> float(area_under_curve([0, 10, 30], [0.0, 1.0, 1.0]))
+        0.8333333333333334
 
     Raises:
         ConfigError: steps that do not rise, another number of scores, or a score that is no finite number.
@@ -190,8 +194,9 @@ def forgetting(scores_N: npt.ArrayLike) -> Any:
     Args:
         scores_N: ``[..., N]``, one task's evaluations in the order of training; N at least 2.
 
-    >>> float(forgetting([1.0, 5.0, 4.0]))
-    1.0
+    Examples:
+        >>> float(forgetting([1.0, 5.0, 4.0]))
+        1.0
 
     Raises:
         ConfigError: fewer than 2 scores, or one that is no finite number.
@@ -246,8 +251,9 @@ def sign_flip_test(differences_S: Sequence[float] | Array, seed: int = 0) -> flo
     2^S sign patterns whose mean difference is at least as far from 0 as the one seen. It cannot be below 2 / 2^S.
     Above 16 seeds, 2^16 patterns are drawn at random, and the pattern seen is counted as one of them.
 
-    >>> sign_flip_test([1.0, 2.0, 3.0])
-    0.25
+    Examples:
+        >>> sign_flip_test([1.0, 2.0, 3.0])
+        0.25
 
     Raises:
         ConfigError: fewer than 2 differences, or one that is no finite number.
@@ -271,8 +277,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
     The i-th smallest of m (from 0) is multiplied by m - i, made at least as large as the one before, and capped at 1.
 
-    >>> [round(p, 3) for p in holm([0.01, 0.04, 0.03])]
-    [0.03, 0.06, 0.06]
+    Examples:
+        >>> [round(p, 3) for p in holm([0.01, 0.04, 0.03])]
+        [0.03, 0.06, 0.06]
 
     Raises:
         ConfigError: a value outside [0, 1].

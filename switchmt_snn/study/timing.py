@@ -70,8 +70,9 @@ class Clock:
 def makespan(seconds: Sequence[float], jobs: int) -> float:
     """The time that works take in order, ``jobs`` at a time.
 
-    >>> makespan([3.0, 1.0, 1.0, 2.0], 2)
-    4.0
+    Examples:
+        >>> makespan([3.0, 1.0, 1.0, 2.0], 2)
+        4.0
     """
     ends = [0.0] * max(1, jobs)
     for one in seconds:

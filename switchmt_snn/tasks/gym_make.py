@@ -80,8 +80,9 @@ def parse_id(name: str) -> tuple[str | None, str]:
     Raises:
         TaskError: another form.
 
-    >>> parse_id("my_module:MyEnv-v0"), parse_id("ALE/Pong-v5")
-    (('my_module', 'MyEnv-v0'), (None, 'ALE/Pong-v5'))
+    Examples:
+        >>> parse_id("my_module:MyEnv-v0"), parse_id("ALE/Pong-v5")
+        (('my_module', 'MyEnv-v0'), (None, 'ALE/Pong-v5'))
     """
     found = _FORM.fullmatch(name)
     if found is None or len(name) > LONGEST_ID:
@@ -104,7 +105,7 @@ def make_environment(name: str, wrappers: Sequence[str] = (), pictured: bool = F
     Raises:
         TaskError: the id is unknown, or the environment or a wrapper cannot be made.
 
-    Example:
+    Examples:
         >>> make_environment("Blackjack-v1", ["FlattenObservation"]).observation_space.shape
         (45,)
     """

@@ -104,8 +104,9 @@ def rounding(space: gymnasium.Space[Any], largest_seen: float) -> str | None:
         space: ``observation_space``.
         largest_seen: the largest absolute value of a play.
 
-    >>> rounding(gymnasium.spaces.Box(0, 255, (2,), np.int32), 0.0) is None
-    True
+    Examples:
+        >>> rounding(gymnasium.spaces.Box(0, 255, (2,), np.int32), 0.0) is None
+        True
     """
     kind = np.dtype(space.dtype)
     if not isinstance(space, gymnasium.spaces.Box) or np.can_cast(kind, np.float32):
@@ -123,8 +124,9 @@ def rounding(space: gymnasium.Space[Any], largest_seen: float) -> str | None:
 def with_wrapper(wrappers: Sequence[str], wrapper: str) -> str:
     """What to do, where one more wrapper helps: the whole list, as the setting takes it.
 
-    >>> with_wrapper(["FlattenAction"], "FlattenObservation")
-    'set tasks.wrappers=[FlattenAction,FlattenObservation]'
+    Examples:
+        >>> with_wrapper(["FlattenAction"], "FlattenObservation")
+        'set tasks.wrappers=[FlattenAction,FlattenObservation]'
     """
     return f"set tasks.wrappers=[{','.join((*wrappers, wrapper))}]"
 

@@ -141,7 +141,7 @@ def check_env(
         ConfigError: no such suite or setting.
         TaskError: training would refuse a task; names it, what was seen, and what to do.
 
-    Example:
+    Examples:
         >>> (report,) = check_env("CartPole-v1", steps=300)
         >>> report.layout, report.frame_shape, report.actions, report.limit_steps, report.repeats
         ('vector', (4,), (0, 1), 500, True)

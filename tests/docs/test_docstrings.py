@@ -103,3 +103,10 @@ def test_every_example_of_a_docstring_is_in_the_list() -> None:
     }
     listed = {Path(inspect.getsourcefile(part)).resolve().relative_to(ROOT).as_posix() for part in EXAMPLES}
     assert with_examples == listed
+
+
+def test_examples_stand_under_the_heading_that_the_site_shows_as_code() -> None:
+    """Without it, ``>>>`` is read as a quotation; under "Example:" as a box of text."""
+    for part in EXAMPLES:
+        before, _, _ = (inspect.getdoc(part) or "").partition(">>> ")
+        assert "\nExamples:\n" in before, part.__qualname__

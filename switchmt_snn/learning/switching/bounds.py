@@ -47,7 +47,7 @@ class SwitchingPolicy(Stateful):
 
     The next task is ``(i + 1) mod |E|``, unless the criterion chooses another one (``Criterion.next_task``).
 
-    Example:
+    Examples:
         >>> import torch
         >>> policy = SwitchingPolicy(SwitchingConfig(policy="fixed_episodes", visit_episodes=1), num_tasks=2)
         >>> seen = {"task": 0, "episodes_in_visit": 1, "steps_in_visit": 9, "updates": 0, "updates_in_visit": 0}

@@ -18,8 +18,9 @@ LOW_PERCENT, HIGH_PERCENT = 10, 90
 def running_means(values: Sequence[float], window: int) -> list[float]:
     """Mean of the newest values, at most ``window``, after each.
 
-    >>> running_means([1.0, 3.0, 5.0], 2)
-    [1.0, 2.0, 4.0]
+    Examples:
+        >>> running_means([1.0, 3.0, 5.0], 2)
+        [1.0, 2.0, 4.0]
     """
     sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
     ends = np.arange(1, len(values) + 1)
@@ -30,8 +31,9 @@ def running_means(values: Sequence[float], window: int) -> list[float]:
 def thinned(count: int, most: int = MOST_POINTS) -> list[int]:
     """Indices of at most ``most`` of ``count`` values, evenly.
 
-    >>> thinned(3), thinned(5, 3)
-    ([0, 1, 2], [0, 2, 4])
+    Examples:
+        >>> thinned(3), thinned(5, 3)
+        ([0, 1, 2], [0, 2, 4])
     """
     if count <= most:
         return list(range(count))

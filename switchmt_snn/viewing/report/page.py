@@ -45,7 +45,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None, figu
     Raises:
         SwitchMTError: a folder is no run, or a file of it cannot be read.
 
-    Example:
+    Examples:
         >>> from switchmt_snn.viewing.report.page import write_report
         >>> write_report(["runs/mine"])  # doctest: +SKIP
         PosixPath('runs/mine/report.html')
