@@ -57,14 +57,22 @@ def claim_new_run(name: str) -> RunFolder:
 def latest_run() -> Path:
     """The run under ``runs/`` that was begun last, as its environment.json says; a copied file may be younger.
 
+    Only copies of one run were begun in the same microsecond: of them, the one that is farthest, then the first by name
+    (``a`` before ``a-backup``).
+
     Raises:
         RunFolderError: there is none.
     """
     begun = {path.parent: _begun(path) for path in RUNS.glob("*/environment.json")}
-    runs = [(moment, run.name, run) for run, moment in begun.items() if moment is not None]
+    runs = [(moment, _newest_checkpoint(run), run) for run, moment in sorted(begun.items()) if moment is not None]
     if not runs:
         raise RunFolderError(f"no run in {RUNS.resolve()}, expected one; run switchmt-snn train, or name a run folder")
-    return max(runs)[-1]
+    return max(runs, key=lambda run: run[:2])[-1]
+
+
+def _newest_checkpoint(run: Path) -> str:
+    """Its name, which sorts by steps; nothing if there is none."""
+    return max((path.name for path in CheckpointStore(run / "checkpoints").paths()), default="")
 
 
 def _begun(path: Path) -> datetime | None:

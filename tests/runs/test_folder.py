@@ -88,6 +88,17 @@ def test_the_newest_run_was_begun_last_whatever_the_times_of_its_files() -> None
     assert latest_run() == newest
 
 
+def test_a_copy_of_the_newest_run_does_not_take_its_place() -> None:
+    moment = "2026-01-02T10:00:00.123456+00:00"
+    original, copied = begun("a", moment, file_time=1_000), begun("a-backup", moment, file_time=9_000)
+    assert latest_run() == original
+    (copied / "checkpoints" / "step-000000000200").mkdir(parents=True)
+    (original / "checkpoints" / "step-000000001000").mkdir(parents=True)
+    assert latest_run() == original
+    (copied / "checkpoints" / "step-000000003000").mkdir(parents=True)
+    assert latest_run() == copied, "the one that is trained on"
+
+
 def test_without_a_run_there_is_no_newest() -> None:
     with pytest.raises(RunFolderError, match="run switchmt-snn train, or name a run folder"):
         latest_run()
