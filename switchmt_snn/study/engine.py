@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -153,20 +151,9 @@ def _attempt(one: _Running, code: int, folder: StudyFolder) -> Attempt:
     )
 
 
-def command_of(words: Sequence[str]) -> list[str]:
-    """A command of this program, by this Python."""
-    return [sys.executable, "-m", "switchmt_snn", *words]
-
-
 def training_words(trial: Trial, folder: StudyFolder) -> list[str]:
     """What follows ``switchmt-snn`` in the command of a trial."""
     return ["train", str(folder.config(trial)), "--run", str(folder.run(trial))]
-
-
-def environment_of(threads: int) -> dict[str, str]:
-    """The environment of a trial's process: no library begins more threads than the trial has."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    return {**os.environ, **dict.fromkeys(names, str(threads))}
 
 
 def last_words(log: Path) -> str:

@@ -9,7 +9,7 @@ from switchmt_snn.config.checks import require
 from switchmt_snn.study.engine import Training, training_words
 from switchmt_snn.study.folder import StudyFolder
 from switchmt_snn.study.grid import Trial
-from switchmt_snn.study.processes import TrainingProcess
+from switchmt_snn.study.processes import ProgramProcess
 
 
 class LocalEngine:
@@ -21,7 +21,7 @@ class LocalEngine:
 
     def start(self, trial: Trial, folder: StudyFolder) -> Training:
         """Begin ``train`` in a process."""
-        return TrainingProcess(training_words(trial, folder), folder.log(trial), trial.config.threads or 1)
+        return ProgramProcess(training_words(trial, folder), folder.log(trial), trial.config.threads or 1)
 
 
 def free_cores() -> int:

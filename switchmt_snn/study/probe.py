@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-import subprocess
 import tempfile
 import threading
 import time
@@ -23,9 +22,10 @@ from switchmt_snn.config import ExperimentConfig, SwitchingConfig, to_dict, to_y
 from switchmt_snn.errors import TrainingFailed
 from switchmt_snn.runs.listing import folder_bytes
 from switchmt_snn.runs.plan import plan
-from switchmt_snn.study.engine import command_of, environment_of, last_words
+from switchmt_snn.study.engine import last_words
 from switchmt_snn.study.folder import TrialRun
 from switchmt_snn.study.grid import Trial
+from switchmt_snn.study.processes import ProgramProcess
 
 MEASURED_S = 20.0
 """Seconds of learning that are measured."""
@@ -155,22 +155,14 @@ def _measure(trial: Trial, folder: Path, stop: threading.Event, note: Callable[[
 
 
 class _Process:
-    """A command of the program; killed if the probe is stopped."""
+    """A command of the program; killed if the probe is stopped, and ended with it if the probe is killed."""
 
     def __init__(
         self, words: Sequence[str], config: ExperimentConfig, log: Path, trial: Trial, stop: threading.Event
     ) -> None:
         self._log, self._trial, self._stop = log, trial, stop
         self._began = time.monotonic()
-        with log.open("ab") as stream:
-            self._popen = subprocess.Popen(
-                command_of(words),
-                stdin=subprocess.DEVNULL,
-                stdout=stream,
-                stderr=subprocess.STDOUT,
-                env=environment_of(config.threads or 1),
-                start_new_session=True,
-            )
+        self._process = ProgramProcess(words, log, config.threads or 1)
 
     @property
     def seconds(self) -> float:
@@ -180,15 +172,15 @@ class _Process:
     def runs(self) -> bool:
         """Whether it goes on; waits a moment."""
         if self._stop.is_set():
-            self._popen.kill()
+            self._process.kill()
         time.sleep(_POLL_S)
-        return self._popen.poll() is None
+        return self._process.poll() is None
 
     def end(self) -> float:
         """Ask it to save and end; the seconds that this took."""
         asked = self.seconds
-        if self._popen.poll() is None:
-            self._popen.send_signal(signal.SIGTERM)
+        if self._process.poll() is None:
+            self._process.ask_to_stop()
         self.wait((0, 130, -signal.SIGTERM))
         return self.seconds - asked
 
@@ -202,7 +194,7 @@ class _Process:
             continue
         if self._stop.is_set():
             raise TrainingFailed("the probe was interrupted, expected time for it")
-        if self._popen.returncode not in good:
+        if self._process.poll() not in good:
             raise TrainingFailed(
                 f"the probe of {self._trial.name} failed ({last_words(self._log)}), expected a trial that trains"
             )

@@ -23,7 +23,7 @@ from switchmt_snn.study.engine import Training, training_words
 from switchmt_snn.study.folder import StudyFolder
 from switchmt_snn.study.grid import Trial
 from switchmt_snn.study.local import most_threads
-from switchmt_snn.study.processes import TrainingProcess
+from switchmt_snn.study.processes import ProgramProcess
 
 AUTH_MODE = "RAY_AUTH_MODE"
 REACHABLE_S = 10.0
@@ -131,7 +131,7 @@ class TrialActor:
 
         with Path(log).open("a", encoding="utf-8") as stream:
             stream.write(f"node {ray.get_runtime_context().get_node_id()}\n")
-        self.process = TrainingProcess(words, Path(log), threads, python_path)
+        self.process = ProgramProcess(words, Path(log), threads, python_path)
 
     def poll(self) -> int | None:
         """The exit code, or None while the process runs."""
