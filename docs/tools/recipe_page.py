@@ -105,7 +105,7 @@ def recipe_page() -> str:
     layers = next(iter(runs.values()))["layers"]
     lines += [
         "",
-        "## Share of neurons that never fire",
+        "## Share of neurons that fire in none of 64 observations",
         "",
         _row(["run", "step", *layers]),
         _row(["---"] * (len(layers) + 2)),

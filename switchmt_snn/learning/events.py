@@ -49,7 +49,8 @@ class LayerHealth:
 
     Attributes:
         rate: mean activity (spikes per neuron and simulation step).
-        dead: share of neurons that never fired.
+        dead: share of neurons that fired in none of the observations (``HEALTH_BATCH``). A neuron that fires rarely is
+            among them by chance: a profile, over more decisions, counts fewer.
         saturated: share of neurons that fired at every step.
     """
 

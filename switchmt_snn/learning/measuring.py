@@ -13,6 +13,7 @@ from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 HEALTH_BATCH = 64
+"""Observations in which a layer's activity is measured: few, so that measuring takes no time."""
 INITIAL_SHARE = 0.01
 """How much of the running statistics may still be their initial values when health is measured."""
 

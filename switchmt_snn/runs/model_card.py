@@ -221,7 +221,8 @@ def _limits(
             )
         for layer in task["layers"]:
             if layer["neurons"] and 2 * layer["silent"] > layer["neurons"]:
-                silent = f"{layer['silent']:,} of {layer['neurons']:,} neurons of {layer['name']} never fire"
+                silent = f"{layer['silent']:,} of {layer['neurons']:,} neurons of {layer['name']} fire in none of "
+                silent += f"{task['decisions']:,} decisions"
                 lines.append(f"In {task['task']} {silent}: low energy then says little.")
     return ["## Limits", "", *(f"- {line}" for line in lines), ""]
 

@@ -12,6 +12,7 @@ from switchmt_snn.config.methods import METHOD_TRAITS
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.config.tasks import resolved_frame_stack
 from switchmt_snn.learning.events import LayerHealth, Measured
+from switchmt_snn.learning.measuring import HEALTH_BATCH
 from switchmt_snn.spiking.encodings import encoding_class
 
 DEAD_SHARE = 0.95
@@ -101,11 +102,11 @@ def largest_q(config: ExperimentConfig, returns: ReturnsSeen) -> float:
 
 def _of_layer(name: str, layer: LayerHealth, config: ExperimentConfig) -> dict[str, Warned]:
     if not METHOD_TRAITS[config.network.method].spiking:  # an activation has no highest value to stay at
-        seen = f"layer {name}: {layer.dead:.0%} of the units are never above zero"
+        seen = f"layer {name}: {layer.dead:.0%} of the units are above zero in none of {HEALTH_BATCH} observations"
         return {f"silent {name}": Warned(seen, _for_zeros(name, config))} if layer.dead > DEAD_SHARE else {}
     warnings = {}
     if layer.dead > DEAD_SHARE:
-        seen = f"layer {name}: {layer.dead:.0%} of the neurons never fire"
+        seen = f"layer {name}: {layer.dead:.0%} of the neurons fire in none of {HEALTH_BATCH} observations"
         warnings[f"silent {name}"] = Warned(seen, _for_silence(name, config))
     if layer.saturated > SATURATED_SHARE:
         seen = f"layer {name}: {layer.saturated:.0%} of the neurons fire at every step"

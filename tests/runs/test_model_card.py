@@ -69,7 +69,7 @@ def test_an_agent_no_better_than_random_play_and_a_silent_layer_are_limits(cartp
     path.write_text(json.dumps(facts))
     limits = section(model_card(open_run(cartpole)), "Limits")
     assert "In CartPole-v1 it is not clearly better than random play." in limits
-    assert f"{layer['silent']} of {layer['neurons']} neurons of {layer['name']} never fire" in limits
+    assert f"{layer['silent']} of {layer['neurons']} neurons of {layer['name']} fire in none of " in limits
 
 
 @pytest.mark.slow

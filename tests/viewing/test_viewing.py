@@ -53,7 +53,10 @@ def test_a_healthy_run_says_nothing() -> None:
 @pytest.mark.parametrize(
     ("trouble", "words"),
     [
-        (measured(dead=0.99), ["layer conv1", "99%", "never fire", "lower network.threshold (now 1)"]),
+        (
+            measured(dead=0.99),
+            ["layer conv1", "99%", "fire in none of 64 observations", "lower network.threshold (now 1)"],
+        ),
         (measured(saturated=0.8), ["layer conv1", "80%", "every step", "raise network.threshold (now 1)"]),
         (measured(q=-1e6), ["expected at most about 100", "values explode", "learning.learning_rate (now 0.0001)"]),
     ],
@@ -106,7 +109,7 @@ def test_a_plain_log_says_a_warning_once_while_its_numbers_change(tmp_path: Path
     for dead in (0.96, 0.97, 0.1, 0.98):
         progress(measured(dead=dead))
         progress.stop()  # prints a line
-    assert stream.getvalue().count("never fire") == 1
+    assert stream.getvalue().count("fire in none of") == 1
     assert "96%" in stream.getvalue()
 
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 from switchmt_snn.config import METHOD_TRAITS
 from switchmt_snn.drawing.chart import Chart, Reference, Series
 from switchmt_snn.learning.events import LayerHealth, Measured
+from switchmt_snn.learning.measuring import HEALTH_BATCH
 from switchmt_snn.viewing.progress import RETURN_WINDOW_EPISODES
 from switchmt_snn.viewing.report.curves import (
     HIGH_PERCENT,
@@ -138,11 +139,18 @@ def layer_figures(run: Sources) -> list[Chart]:
         ("rate", "Spikes per neuron and step" if spiking else "Mean activity", False, lambda layer: layer.rate),
         (
             "dead",
-            "Neurons that never fire" if spiking else "Units that are never active",
+            f"Neurons that fire in none of {HEALTH_BATCH} observations"
+            if spiking
+            else f"Units that are active in none of {HEALTH_BATCH} observations",
             True,
             lambda layer: layer.dead,
         ),
-        ("saturated", "Neurons that fire at every step", True, lambda layer: layer.saturated),
+        (
+            "saturated",
+            f"Neurons that fire at every step of {HEALTH_BATCH} observations",
+            True,
+            lambda layer: layer.saturated,
+        ),
     ]
     rows = [row for row in run.history.measured if row.layers]
     parts = {"": rows}
