@@ -36,6 +36,14 @@ learning: {batch_size: 4, learning_starts_steps: 20, replay_capacity_steps: 300,
 evaluation: {episodes: 2, epsilon: 0.0, every_steps: 120, max_episode_steps: 60}
 recording: {checkpoint_every_steps: 80, metrics_every_steps: 100, keep_checkpoints: 2}
 """
+STUDY = """
+base: config.yaml
+name: crash
+settings: {total_steps: 160}
+vary: {learning.learning_rate: [0.01, 0.001]}
+seeds: [3]
+"""
+"""Two trials; they train in processes of their own, which save and end when the study is ended."""
 BY_RETURNS = ("--evaluation.every-steps", "None", "--total-steps", "800")
 """Longer, so that the task has the episodes by which weights are judged."""
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -44,7 +52,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "evaluate": ("evaluate", "RUN", "--episodes", "3"),
     "export": ("export", "RUN", "--parity-decisions", "8"),
     "profile": ("profile", "RUN", "--decisions", "8"),
+    "play": ("play", "RUN", "--seconds", "0.5", "--fps", "10", "--out", "RUN/films/played.gif"),
     "report": ("report", "RUN", "--figures"),
+    "study": ("study", "STUDY", "--folder", "RUN", "--jobs", "1"),
 }
 _EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.symlink"}
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -55,8 +65,10 @@ _VARIES = re.compile(
 
 def words(command: str, folder: Path) -> list[str]:
     """A command's words, for a run in a folder."""
-    places = {"CONFIG": str(folder / "config.yaml"), "RUN": str(folder / "run")}
-    return [places.get(word, word) for word in COMMANDS[command]]
+    places = {"CONFIG": "config.yaml", "STUDY": "study.yaml", "RUN": "run"}
+    return [
+        re.sub(r"^(CONFIG|STUDY|RUN)\b", lambda at: str(folder / places[at[0]]), word) for word in COMMANDS[command]
+    ]
 
 
 def run_until(argv: list[str], folder: Path, point: int | None) -> tuple[int, int]:
@@ -106,7 +118,11 @@ def _count_operations(folder: str, point: int | None, writing: int) -> Callable[
         if event not in _EVENTS or (event == "open" and not (arguments[2] or 0) & _WRITES):
             return
         place = arguments[0]
-        if isinstance(place, int) or str(os.fspath(place)).startswith(folder) or not os.path.isabs(os.fspath(place)):
+        if (
+            isinstance(place, int)
+            or str(os.fspath(place)).startswith(f"{folder}{os.sep}")
+            or not os.path.isabs(os.fspath(place))
+        ):
             step()
 
     sync = os.fsync
@@ -125,7 +141,8 @@ def prepared(command: str, folder: Path, finished: Path | None) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(CONFIG)
-    if finished is not None and not command.startswith("train"):
+    (folder / "study.yaml").write_text(STUDY)
+    if finished is not None and not command.startswith(("train", "study")):
         shutil.copytree(finished / "run", folder / "run")
 
 
@@ -136,16 +153,17 @@ def products(folder: Path) -> dict[str, Any]:
         name = str(path.relative_to(folder / "run"))
         if (
             path.is_file()
-            and not name.endswith((".tmp", ".lock", ".zst", ".html", ".svg", ".png"))
+            and not name.endswith((".tmp", ".lock", ".log", ".zst", ".html", ".svg", ".png"))
             and "environment" not in name
+            and name != "attempts.jsonl"  # a study's processes, of which a crash ends one
         ):
-            found[name] = _content(path)
+            found[name] = _content(path, folder)
     return found
 
 
-def _content(path: Path) -> Any:
+def _content(path: Path, folder: Path) -> Any:
     if path.suffix == ".json":
-        facts = json.loads(path.read_bytes())
+        facts = json.loads(path.read_text().replace(str(folder), "FOLDER"))
         if path.name == "manifest.json":
             facts = {key: facts.get(key) for key in ("step", "score", "judged_by")}
         return _timeless(facts)

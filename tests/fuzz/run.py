@@ -1,6 +1,7 @@
 """The long campaign: ``python -m tests.fuzz.run config --mutants 10000 --seed 1``; a fault leaves its mutant behind.
 
 ``--record results/reliability/campaigns.json`` keeps the counts; ``python -m docs.generate`` makes the table of them.
+``--first 5000`` begins at mutant 5,000: with ``--record`` it continues the campaign of the same seed that ended there.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from typing import Any
 from tests.fuzz.formats import FORMATS, mutant_of, outcome
 
 
-def campaign(name: str, mutants: int, seed: int, kept: Path) -> collections.Counter[str]:
-    """Play mutants of a format; counts of ``taken``, ``refused`` and ``fault``."""
+def campaign(name: str, mutants: int, seed: int, kept: Path, first: int = 0) -> collections.Counter[str]:
+    """Play mutants of a format from number ``first`` of a seed on; counts of ``taken``, ``refused`` and ``fault``."""
     counts: collections.Counter[str] = collections.Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(seed * 1_000_000, seed * 1_000_000 + mutants):
+        for number in range(seed * 1_000_000 + first, seed * 1_000_000 + first + mutants):
             content = mutant_of(name, number)
             try:
                 line = outcome(name, Path(folder), content, number)
@@ -56,10 +57,24 @@ def record(path: Path, key: str, row: dict[str, Any]) -> None:
     path.write_text(json.dumps(dict(sorted({**rows, key: row}.items())), indent=1) + "\n")
 
 
+def continued(path: Path, name: str, row: dict[str, Any], first: int) -> dict[str, Any]:
+    """A row that includes the one of the same seed's first mutants.
+
+    Raises:
+        ValueError: the file has no such row.
+    """
+    before = json.loads(path.read_text()).get(name, {}) if path.exists() else {}
+    if (before.get("seed"), before.get("mutants")) != (row["seed"], first):
+        raise ValueError(f"{path} has no row of the first {first} mutants of {name} with seed {row['seed']}")
+    sums = {key: before[key] + row[key] for key in ("mutants", "taken", "refused", "fault", "processor_s")}
+    return {**row, **sums, "memory_grew_mib": max(before["memory_grew_mib"], row["memory_grew_mib"])}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("format", choices=[*FORMATS, "all"])
     parser.add_argument("--mutants", type=int, default=10_000)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kept", type=Path, default=Path("fuzz-faults"), help="folder for mutants with a fault")
     parser.add_argument("--record", type=Path, help="JSON file whose row of the format is replaced")
@@ -67,7 +82,7 @@ def main() -> int:
     faults = 0
     for name in FORMATS if options.format == "all" else [options.format]:
         start, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        counts = campaign(name, options.mutants, options.seed, options.kept)
+        counts = campaign(name, options.mutants, options.seed, options.kept, options.first)
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
         seconds = time.process_time() - start
         print(
@@ -85,7 +100,7 @@ def main() -> int:
                 "memory_grew_mib": round(grown),
                 "environment": environment(),
             }
-            record(options.record, name, row)
+            record(options.record, name, continued(options.record, name, row, options.first) if options.first else row)
     return 1 if faults else 0
 
 

@@ -15,11 +15,17 @@ from PIL import Image
 from switchmt_snn.errors import ConfigError, MissingExtraError, RunFolderError, TrainingFailed
 
 CODERS = {
-    ".mp4": ("-c:v", "libx264", "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+    ".mp4": (
+        *("-c:v", "libx264", "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+        *("-f", "mp4"),
+    ),
     # A palette of its own for each frame, so that no frame waits for the last one's colours.
-    ".gif": ("-filter_complex", "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"),
+    ".gif": (
+        *("-filter_complex", "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"),
+        *("-f", "gif"),
+    ),
 }
-"""ffmpeg's options by the file's ending."""
+"""ffmpeg's options by the file's ending; the format too, because the temporary name has another ending."""
 
 
 class StopFilm(Exception):
@@ -49,7 +55,7 @@ class VideoFile:
             MissingExtraError: the package that brings ffmpeg is not installed.
         """
         self._path = path
-        self._temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         self._closing = contextlib.ExitStack()
         self._complaints = self._closing.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         shape = f"{size[0]}x{size[1]}"
