@@ -31,7 +31,7 @@ from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, onnx_session, read_nir
 from switchmt_snn.export.runtimes.guarded import read_file
 from switchmt_snn.runs.evaluations import evaluation_name
-from switchmt_snn.runs.files import file_name, json_text, sha256, write_atomically, written_whole
+from switchmt_snn.runs.files import file_name, json_text, made, sha256, write_atomically
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.model_card import CARD, model_card
 from switchmt_snn.runs.packing import open_run
@@ -120,7 +120,7 @@ def export(
     for name, reason in built.left_out.items():
         note(f"left out {name.upper()}: {reason}")
     run_folder = open_run(run_folder.path, to_write=True)
-    folder = _made(Path(out) if out is not None else run_folder.path / "export")
+    folder = made(Path(out) if out is not None else run_folder.path / "export", "--out")
     facts = provenance(run_folder.path) | {"weights": "int8" if settings.int8 else "float32"}
     for name in ("parity.json", CARD):  # of the files that are replaced now
         (folder / name).unlink(missing_ok=True)
@@ -152,16 +152,6 @@ def export(
     write_atomically(folder / CARD, card.encode())
     note(f"wrote {folder / CARD}")
     return ExportResult(folder, files, parity, built.left_out)
-
-
-def _made(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExportError(
-            f"{folder} cannot be made ({error.strerror}), expected a folder to write to; use --out"
-        ) from error
-    return folder
 
 
 @dataclass(frozen=True)
@@ -235,8 +225,7 @@ def _write_nir(
     for task, graph in graphs.items():
         graph.metadata.update(facts)
         path = folder / f"{file_name(task)}.nir"
-        with written_whole(path) as temporary:
-            write_nir(graph, temporary)
+        write_nir(graph, path)
         beside = metadata(network) | facts | {"task": task, DIALECT_KEY: dialect_of(graph), "dt": graph.metadata["dt"]}
         write_atomically(path.with_suffix(".json"), json_text(beside, indent=1).encode())
         files[path.name] = path
@@ -287,7 +276,7 @@ def evaluate_exported(
     share = equal / decisions
     facts = {"runtime": runtime, "equal_actions_share": share, "decisions": decisions, **evaluation.to_dict()}
     path = folder.path / "export" / "evaluations" / f"{runtime}_{evaluation_name(evaluation)}.json"
-    path.parent.mkdir(exist_ok=True)
+    made(path.parent)
     write_atomically(path, json_text(facts, indent=1).encode())
     return evaluation, share
 

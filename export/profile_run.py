@@ -18,7 +18,7 @@ import torch
 
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.drawing.files import figure_files
-from switchmt_snn.errors import ConfigError, ExportError
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.export.chips.fit import check_fit, layer_shapes
 from switchmt_snn.export.chips.precision import effect_of_precision
 from switchmt_snn.export.counts.network import TaskCounter, TaskCounts
@@ -37,7 +37,7 @@ from switchmt_snn.export.report.verdict import silent_layers, verdict
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.environment import command_line
-from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.runs.files import json_text, made, write_atomically, writing
 from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.run import load_agent
 from switchmt_snn.tasks.registry import suite_of
@@ -191,14 +191,8 @@ def compare_profiles(profiles: Iterable[ProfileResult], out: str | Path | None =
 
 def _folder(folder: Path) -> Path:
     """Make a folder, and see that it can be written to before anything is computed."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError as error:
-        raise ExportError(
-            f"{folder} cannot be written to ({error.strerror}), expected a folder of yours; use --out"
-        ) from error
+    with writing(made(folder, "--out"), "--out"), tempfile.TemporaryFile(dir=folder):
+        return folder
 
 
 def _written(
@@ -228,9 +222,8 @@ def _written(
     facts["figures"] = [asdict(figure) for figure in figures]
     write_atomically(folder / "profile.json", json_text(facts, indent=1).encode())
     write_atomically(folder / "layers.csv", _layers_csv(profiles).encode())
-    (folder / "figures").mkdir(exist_ok=True)
     for name, content in figure_files(figures).items():
-        write_atomically(folder / "figures" / name, content)
+        write_atomically(made(folder / "figures") / name, content)
     write_atomically(folder / "report.html", render_report([facts], [frames], facts["command"]).encode())
     return ProfileResult(folder, facts, frames)
 

@@ -15,7 +15,7 @@ from switchmt_snn.errors import ExportError
 from switchmt_snn.export.npz import read_npz
 from switchmt_snn.machine.cores import parts
 from switchmt_snn.machine.progress import progress_of
-from switchmt_snn.runs.files import file_name, written_whole
+from switchmt_snn.runs.files import file_name, made, written_whole
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -83,7 +83,7 @@ def recorded_play(
         if len(recording.actions) >= decisions and not stale:
             return _first(recording, decisions)
     recording = play(agent, task, decisions, config.epsilon, config.seed, go_on)
-    folder.mkdir(parents=True, exist_ok=True)
+    made(folder)
     with written_whole(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(
             stream,

@@ -6,6 +6,7 @@ The command line prints the message as one line and exits with ``exit_code``; a 
 from __future__ import annotations
 
 import difflib
+import errno
 import math
 from collections.abc import Iterable
 
@@ -23,6 +24,10 @@ class SwitchMTError(Exception):
 
     exit_code = 2
 
+    def __init__(self, message: object = "") -> None:
+        """Make it; whatever names are in the message, it is one line that a terminal shows as it is."""
+        super().__init__(_escaped(str(message)))
+
 
 class ConfigError(SwitchMTError):
     """A setting is unknown, of the wrong type, out of range, or contradicts another one."""
@@ -34,6 +39,39 @@ class TaskError(SwitchMTError):
 
 class RunFolderError(SwitchMTError):
     """The run folder is missing, foreign, in use, not writable, or holds another config."""
+
+
+class WriteError(RunFolderError):
+    """A file or folder cannot be written.
+
+    ``exit_code`` is 2 for a place that is wrong (another one may do), and 1 for a disk that is full or fails.
+
+    Attributes:
+        seen: what could not be written, and why; the message without what to do.
+    """
+
+    def __init__(self, path: object, error: OSError, option: str | None = None) -> None:
+        """Make it.
+
+        Args:
+            path: of the file or folder.
+            error: what the system said.
+            option: by which a user names another place.
+        """
+        self.seen = f"{path} cannot be written ({error.strerror or reason_of(error)})"
+        if error.errno in _WRONG_PLACE:
+            remedy = "" if option is None else f"; name another with {option}"
+            super().__init__(f"{self.seen}, expected a writable folder{remedy}")
+        else:
+            self.exit_code = 1
+            super().__init__(f"{self.seen}, expected a disk that works and has room; then run the same command again")
+
+
+_WRONG_PLACE = {
+    *(errno.EACCES, errno.EEXIST, errno.EINVAL, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOENT),
+    *(errno.ENOTDIR, errno.ENOTEMPTY, errno.EPERM, errno.EROFS, errno.EXDEV),
+}
+"""What the system says of a place that no waiting makes right."""
 
 
 class CheckpointError(SwitchMTError):
@@ -82,8 +120,12 @@ def printable(text: object) -> str:
         >>> printable("a\\x1b[2J")
         'a\\\\x1b[2J'
     """
-    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in str(text)[:501])
+    shown = _escaped(str(text)[:501])
     return shown if len(shown) <= 500 else shown[:497] + "..."
+
+
+def _escaped(text: str) -> str:
+    return text if text.isprintable() else "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text)
 
 
 def reason_of(error: BaseException) -> str:

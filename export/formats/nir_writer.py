@@ -21,6 +21,7 @@ nir.CubaLIF: it resets at the spike, while ``snntorch.Synaptic`` resets after th
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from pathlib import Path
@@ -33,6 +34,7 @@ import numpy.typing as npt
 
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export.folded import metadata
+from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.spiking.folding import FoldedNetwork
 from switchmt_snn.spiking.layers import Array, Conv, Dense, Float, Layer, NeuronNode, SynapseNode, no_rule
 from switchmt_snn.spiking.neurons import AdaptiveNode, LeakyNode, ReLUNode, SynapticNode
@@ -110,13 +112,21 @@ def never_choosing_others(network: FoldedNetwork, task: int) -> SynapseNode:
 
 
 def write_nir(graph: nir.NIRGraph, path: Path) -> None:
-    """Write a graph to a file; the ``legacy`` dialect leaves the all-zero ``v_reset`` out."""
-    nir.write(path, graph)
+    """Write a graph to a file; the ``legacy`` dialect leaves the all-zero ``v_reset`` out.
+
+    HDF5 writes into memory: on a full disk it would fail once more whenever one of its objects is freed.
+
+    Raises:
+        WriteError: the system refused.
+    """
+    content = io.BytesIO()
+    nir.write(content, graph)
     if dialect_of(graph) == "legacy":
-        with h5py.File(path, "a") as file:
+        with h5py.File(content, "r+") as file:
             for node in cast(Any, file["node/nodes"]).values():
                 if "v_reset" in node:
                     del node["v_reset"]
+    write_atomically(path, content.getvalue())
 
 
 def dialect_of(graph: nir.NIRGraph) -> NirDialect:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from switchmt_snn.cli.parsing import parse, split_one
-from switchmt_snn.errors import ConfigError
 from switchmt_snn.runs.files import write_atomically
 from switchmt_snn.viewing import output
 
@@ -40,13 +39,7 @@ def command(argv: list[str]) -> int:
     with ProgressBars():
         replayed = replay_policies(open_run(name), options.policy, options.set)
     if options.out is not None:
-        try:
-            write_atomically(options.out, csv_text(replayed).encode())
-        except OSError as error:
-            raise ConfigError(
-                f"--out {options.out} cannot be written ({error.strerror or error}), expected a file in a folder that "
-                "is there and writable; name another one"
-            ) from error
+        write_atomically(options.out, csv_text(replayed).encode(), "--out")
     if options.json:
         output.print_json(replayed.to_dict(), indent=1)
     else:

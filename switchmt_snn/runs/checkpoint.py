@@ -32,7 +32,7 @@ import zstandard
 
 from switchmt_snn.errors import CheckpointError, reason_of, require_saved, shown
 from switchmt_snn.replay.ring import FrameReplay, Segment
-from switchmt_snn.runs.files import sha256, sync_folder, write_atomically
+from switchmt_snn.runs.files import made, sha256, sync_folder, write_atomically, writing
 from switchmt_snn.runs.manifest import FORMAT, read_json, read_manifest, seal
 from switchmt_snn.runs.state_tree import MODEL_PREFIXES, join, split
 
@@ -130,33 +130,24 @@ class CheckpointStore:
             acting_network: which network becomes ``model.safetensors``, ``online`` or ``target``.
 
         Raises:
-            OSError: the disk is full or not writable; older checkpoints are untouched.
+            WriteError: the disk is full or not writable; older checkpoints are untouched.
         """
-        self._replay_folder.mkdir(parents=True, exist_ok=True)
+        made(self._replay_folder)
         segments = [entry for task, replay in enumerate(replays) for entry in self._store_segments(task, replay)]
         final = self.folder / _name(step)
         if final.is_dir() and self._is_whole(final):
             return final  # saved already at this very step, and a step has one state
-        temporary = self.folder / f".{final.name}.tmp"
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
-        try:
-            model, training, tree = split(state, MODEL_PREFIXES[acting_network])
-            files = {
-                _MODEL_FILE: safetensors.torch.save(model),
-                "training.safetensors": safetensors.torch.save(training),
-                "state.json": json.dumps(tree).encode(),
-            }
-            facts = {"step": step, "acting_network": acting_network, "segments": segments, "logs": log_sizes}
-            self._write_folder(temporary, files, facts)
-            if final.exists():
-                shutil.rmtree(final)
-            temporary.rename(final)
-        except OSError:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
+        model, training, tree = split(state, MODEL_PREFIXES[acting_network])
+        files = {
+            _MODEL_FILE: safetensors.torch.save(model),
+            "training.safetensors": safetensors.torch.save(training),
+            "state.json": json.dumps(tree).encode(),
+        }
+        facts = {"step": step, "acting_network": acting_network, "segments": segments, "logs": log_sizes}
+        self._write_folder(final, files, facts)
         sync_folder(self.folder)
-        self._remove_old()
+        with writing(self.folder):
+            self._remove_old()
         return final
 
     def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float, judged_by: str) -> None:
@@ -168,18 +159,8 @@ class CheckpointStore:
         self._save_model(self.folder / _name(step), network_state, {"step": step})
 
     def _save_model(self, final: Path, network_state: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
-        temporary = self.folder / f".{final.name}.tmp"
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        try:
-            model = {name: tensor.detach().cpu().contiguous() for name, tensor in network_state.items()}
-            files = {_MODEL_FILE: safetensors.torch.save(model)}
-            self._write_folder(temporary, files, {**facts, "segments": [], "logs": {}})
-            shutil.rmtree(final, ignore_errors=True)
-            temporary.rename(final)
-        except OSError:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
+        model = {name: tensor.detach().cpu().contiguous() for name, tensor in network_state.items()}
+        self._write_folder(final, {_MODEL_FILE: safetensors.torch.save(model)}, {**facts, "segments": [], "logs": {}})
 
     def best(self) -> Best | None:
         """What is known of the best weights; None if there are none."""
@@ -189,13 +170,24 @@ class CheckpointStore:
             return None
         return Best(int(manifest["step"]), float(manifest["score"]), manifest.get("judged_by", "returns"))
 
-    def _write_folder(self, folder: Path, files: dict[str, bytes], facts: dict[str, Any]) -> None:
-        for name, content in files.items():
-            write_atomically(folder / name, content)
+    def _write_folder(self, final: Path, files: dict[str, bytes], facts: dict[str, Any]) -> None:
+        """Write a checkpoint's folder under a temporary name, then rename it."""
+        temporary = self.folder / f".{final.name}.tmp"
         sums = {name: sha256(content) for name, content in files.items()}
         manifest = {"format": FORMAT, "program": "switchmt-snn", **facts, "files": sums}
         sealed = {**manifest, "seal": seal(manifest)}
-        write_atomically(folder / "manifest.json", json.dumps(sealed, indent=1).encode())
+        shutil.rmtree(temporary, ignore_errors=True)
+        with writing(final):
+            try:
+                temporary.mkdir(parents=True)
+                for name, content in files.items():
+                    write_atomically(temporary / name, content)
+                write_atomically(temporary / "manifest.json", json.dumps(sealed, indent=1).encode())
+                if final.exists():
+                    shutil.rmtree(final)
+                temporary.rename(final)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
 
     def _store_segments(self, task: int, replay: FrameReplay) -> Iterator[dict[str, Any]]:
         for segment in replay.segments():

@@ -18,7 +18,7 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol
 from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.numbers import exact
 from switchmt_snn.errors import ConfigError, RunFolderError, reason_of
-from switchmt_snn.runs.files import file_name, json_text, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, made, write_atomically
 
 CLEARLY_ABOVE = 1.96
 """Standard errors of the difference of two means by which an agent must lead random play to be called better."""
@@ -42,15 +42,14 @@ class Evaluations:
         """Write a summary (JSON) and the episodes (CSV); returns the CSV's path.
 
         Raises:
-            OSError: the folder cannot be written.
+            WriteError: the folder cannot be written.
         """
         rows = [asdict(episode) for episode in evaluation.episodes]
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-        self.folder.mkdir(exist_ok=True)
-        path = self.folder / f"{evaluation_name(evaluation)}.csv"
+        path = made(self.folder) / f"{evaluation_name(evaluation)}.csv"
         write_atomically(path, text.getvalue().encode())
         write_atomically(path.with_suffix(".json"), json_text(evaluation.to_dict(), indent=1).encode())
         return path

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from switchmt_snn.errors import WriteError
+
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _LONGEST_LIST = 120
 _NOT_TASKS = frozenset({"parity", "evaluation_onnx", "evaluation_nir"})
@@ -62,23 +64,65 @@ def _finite(value: Any) -> Any:
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def writing(path: Path, option: str | None = None) -> Iterator[None]:
+    """Around code that writes a file or folder: what the system refuses becomes one line that names ``path``.
+
+    Of two of them, one within the other, the outer one names what could not be written.
+
+    Args:
+        path: what is written, by the name that it has in the end.
+        option: by which a user names another place.
+
+    Raises:
+        WriteError: the system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(path, error, option) from error
+    except WriteError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+        raise WriteError(path, error.__cause__, option) from error.__cause__
+
+
+def made(folder: Path, option: str | None = None) -> Path:
+    """A folder, made with those above it if it is not there.
+
+    Raises:
+        WriteError: it cannot be.
+    """
+    with writing(folder, option):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@contextmanager
+def written_whole(path: Path, option: str | None = None) -> Iterator[Path]:
     """A temporary path beside ``path`` for code that writes a file itself; at the end it takes the file's place.
 
     Each call has another one, because other processes and threads may write the same file. If the code fails, nothing
     stays of it.
+
+    Raises:
+        WriteError: the system refused.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with writing(path, option):
+        try:
+            yield temporary
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a crash at any moment leaves the old content or the new one."""
-    with written_whole(path) as temporary, temporary.open("wb") as stream:
+def write_atomically(path: Path, content: bytes, option: str | None = None) -> None:
+    """Write a file so that a crash at any moment leaves the old content or the new one.
+
+    Raises:
+        WriteError: the system refused.
+    """
+    with written_whole(path, option) as temporary, temporary.open("wb") as stream:
         stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
@@ -87,11 +131,12 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Make renames within a folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with writing(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def sha256(content: bytes) -> str:

@@ -20,10 +20,10 @@ import filelock
 from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.config.bounds import LARGEST
-from switchmt_snn.errors import ConfigError, RunFolderError, nearest
+from switchmt_snn.errors import ConfigError, RunFolderError, WriteError, nearest
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
-from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.runs.files import json_text, write_atomically, writing
 
 RUNS = Path("runs")
 LOCK = {"run.lock"}
@@ -49,7 +49,7 @@ def claim_new_run(name: str) -> RunFolder:
         except FileExistsError:
             continue
         except OSError as error:
-            raise RunFolderError(unwritable(path, error)) from error
+            raise WriteError(path, error, "--run") from error
         return RunFolder(path)
     raise AssertionError("unreachable: the numbers do not end")
 
@@ -201,7 +201,7 @@ class RunFolder:
         Raises:
             RunFolderError: the folder holds other files, or cannot be written.
         """
-        try:
+        with writing(self.path, "--run"):
             self.path.mkdir(parents=True, exist_ok=True)
             if not self._is_free:
                 raise RunFolderError(
@@ -213,8 +213,6 @@ class RunFolder:
             write_atomically(self.path / "config.yaml", to_yaml(config, asked).encode())
             # Last: a folder is a run once this file says so.
             write_atomically(self.path / "environment.json", json_text(environment, indent=1).encode())
-        except OSError as error:
-            raise RunFolderError(unwritable(self.path, error)) from error
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Replace the stored config (a raised step budget)."""
@@ -248,10 +246,7 @@ class RunFolder:
 
     def save_evaluation(self, evaluation: Evaluation) -> Path:
         """Write a summary (JSON) and the episodes (CSV) of an evaluation; returns the CSV's path."""
-        try:
-            return self.evaluations.save(evaluation)
-        except OSError as error:
-            raise RunFolderError(unwritable(self.evaluations.folder, error)) from error
+        return self.evaluations.save(evaluation)
 
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""
@@ -283,14 +278,8 @@ def locked(folder: Path, what: str, option: str = "--run") -> filelock.BaseFileL
             f"one with {option}"
         ) from error
     except OSError as error:
-        raise RunFolderError(unwritable(folder, error, option)) from error
+        raise WriteError(folder, error, option) from error
     return lock
-
-
-def unwritable(path: Path, error: OSError, option: str = "--run") -> str:
-    """The line for a folder that the system does not let be written; ``option`` names another one."""
-    reason = error.strerror or error
-    return f"{path} cannot be written ({reason}), expected a writable folder; name another with {option}"
 
 
 def check_same_config(stored: ExperimentConfig, asked: ExperimentConfig, path: Path) -> None:

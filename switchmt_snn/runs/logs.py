@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import time
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -14,7 +15,7 @@ from switchmt_snn.errors import RunFolderError
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, SwitchDecided
 from switchmt_snn.learning.switching import DECISION_COLUMNS, SwitchTo
 from switchmt_snn.machine.memory import peak_bytes, peak_device_bytes
-from switchmt_snn.runs.files import json_text
+from switchmt_snn.runs.files import json_text, writing
 
 EPISODE_COLUMNS = ("step", "task", "episode", "return", "length_steps", "truncated", "epsilon", "updates", "wall_s")
 
@@ -42,7 +43,7 @@ class RunLogs:
             RunFolderError: a file that is continued is missing, is shorter than at the checkpoint, or has no column for
                 one of the numbers. No file is changed then.
         """
-        self._tasks = task_names
+        self._folder, self._tasks = folder, task_names
         self._started = time.monotonic()
         if sizes is not None:
             _require_bytes(folder, sizes)
@@ -55,20 +56,30 @@ class RunLogs:
             for name, columns in tables.items()
         }
         if sizes is None:
-            for table in self._tables.values():
-                table.writeheader()
+            for name, table in self._tables.items():
+                with writing(folder / name):
+                    table.writeheader()
 
     def __call__(self, event: Event) -> None:
-        """Write an event down."""
+        """Write an event down.
+
+        Raises:
+            WriteError: the system refused.
+        """
         wall_s = round(time.monotonic() - self._started, 3)
         if isinstance(event, EpisodeEnded):
-            self._tables["episodes.csv"].writerow(self._episode_row(event) | {"wall_s": wall_s})
+            self._write_row("episodes.csv", self._episode_row(event) | {"wall_s": wall_s})
         elif isinstance(event, SwitchDecided):
-            self._tables["switches.csv"].writerow(self._switch_row(event))
+            self._write_row("switches.csv", self._switch_row(event))
         elif isinstance(event, Measured):
             taken = {"peak_memory_bytes": peak_bytes(), "peak_device_memory_bytes": peak_device_bytes()}
             row = self._metrics_row(event) | {"wall_s": wall_s} | taken
-            self._files["metrics.jsonl"].write(json_text(row) + "\n")
+            with writing(self._folder / "metrics.jsonl"):
+                self._files["metrics.jsonl"].write(json_text(row) + "\n")
+
+    def _write_row(self, name: str, row: dict[str, Any]) -> None:
+        with writing(self._folder / name):
+            self._tables[name].writerow(row)
 
     def _episode_row(self, event: EpisodeEnded) -> dict[str, Any]:
         return {
@@ -112,15 +123,17 @@ class RunLogs:
         """Bring everything to the disk; returns the size of each file."""
         sizes = {}
         for name, stream in self._files.items():
-            stream.flush()
-            os.fsync(stream.fileno())
-            sizes[name] = stream.tell()
+            with writing(self._folder / name):
+                stream.flush()
+                os.fsync(stream.fileno())
+                sizes[name] = stream.tell()
         return sizes
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files. A line that could not be written raised its error when it was written."""
         for stream in self._files.values():
-            stream.close()
+            with suppress(OSError):
+                stream.close()
 
 
 def _require_bytes(folder: Path, sizes: dict[str, int]) -> None:
@@ -140,8 +153,9 @@ def _require_bytes(folder: Path, sizes: dict[str, int]) -> None:
 
 
 def _opened(path: Path, sizes: dict[str, int] | None) -> IO[str]:
-    stream = path.open("a", buffering=1, encoding="utf-8", newline="")  # 1: line by line
-    stream.truncate(0 if sizes is None else sizes[path.name])
+    with writing(path):
+        stream = path.open("a", buffering=1, encoding="utf-8", newline="")  # 1: line by line
+        stream.truncate(0 if sizes is None else sizes[path.name])
     return stream
 
 

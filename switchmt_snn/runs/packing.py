@@ -8,8 +8,8 @@ import tempfile
 from pathlib import Path
 
 from switchmt_snn.errors import RunFolderError, nearest
-from switchmt_snn.runs.files import write_atomically
-from switchmt_snn.runs.folder import RunFolder, latest_run, unwritable
+from switchmt_snn.runs.files import write_atomically, writing
+from switchmt_snn.runs.folder import RunFolder, latest_run
 from switchmt_snn.runs.model_card import CARD, model_card
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
@@ -111,10 +111,10 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
     if out.exists():
         raise RunFolderError(f"{out} exists, expected a new folder; name another with --out")
     step, weights = folder.checkpoints().load_model(checkpoint)
-    try:
+    with writing(out, "--out"):
         out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as made:
-            packed = RunFolder(Path(made) / out.name)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.", suffix=".tmp") as unfinished:
+            packed = RunFolder(Path(unfinished) / out.name)
             packed.path.mkdir()
             for name in _FILES:
                 if (folder.path / name).is_file():
@@ -126,21 +126,17 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
             packed.checkpoints().save_weights(step, weights)
             write_atomically(packed.path / CARD, model_card(packed).encode())
             packed.path.rename(out)
-    except OSError as error:
-        raise RunFolderError(unwritable(out, error, "--out")) from error
     return out
 
 
 def _whole_copy(source: Path, target: Path) -> None:
     """Copy a folder so that it is whole or absent; of two processes that do it at once, one wins."""
-    try:
+    with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as made:
-            shutil.copytree(source, Path(made) / target.name, copy_function=shutil.copyfile)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp") as unfinished:
+            shutil.copytree(source, Path(unfinished) / target.name, copy_function=shutil.copyfile)
             try:
-                (Path(made) / target.name).rename(target)
+                (Path(unfinished) / target.name).rename(target)
             except OSError:
                 if not RunFolder(target).is_run:
                     raise
-    except OSError as error:
-        raise RunFolderError(unwritable(target, error)) from error

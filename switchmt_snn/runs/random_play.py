@@ -26,7 +26,7 @@ from switchmt_snn.acting.episodes import EpisodeScore
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.runs.environment import processor
-from switchmt_snn.runs.files import file_name, json_text, sha256, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, made, sha256, write_atomically
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -64,12 +64,12 @@ class RandomPlay:
         """Keep episodes that were played now; scores that JSON cannot hold (NaN) are not kept.
 
         Raises:
-            OSError: the folder cannot be written.
+            WriteError: the folder cannot be written.
         """
         if self._facts is None or not all(np.isfinite(episode.score) for episode in episodes):
             return
         facts, path = self._of(task)
-        self.folder.mkdir(exist_ok=True)
+        made(self.folder)
         content = {"decided_by": facts, "episodes": [asdict(episode) for episode in episodes]}
         write_atomically(path, json_text(content, indent=1).encode())
 

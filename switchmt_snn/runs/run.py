@@ -15,7 +15,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, EvaluationStopped, evaluate_agent
 from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, load_config, to_dict
 from switchmt_snn.config.plugins import plugin_name
-from switchmt_snn.errors import CheckpointError, TrainingFailed
+from switchmt_snn.errors import CheckpointError, TrainingFailed, WriteError
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.switching import Criterion, with_policy
@@ -224,11 +224,10 @@ class _Driver:
             return RunResult(self.folder.path, "already_finished", training.steps, None, self.solved)
         try:
             return self._run(log_sizes, resumed_at, [*self.notes, *notes])
-        except OSError as error:
+        except WriteError as error:
             raise TrainingFailed(
-                f"writing to {self.folder.path} failed at step {training.steps} ({error.strerror or error}), expected "
-                "a disk with room; the last whole checkpoint is kept: make room and run the same command with "
-                f"--run {shlex.quote(str(self.folder.path))}"
+                f"{error.seen} at step {training.steps}, expected a disk that works and has room; the last whole "
+                f"checkpoint is kept: then run the same command with --run {shlex.quote(str(self.folder.path))}"
             ) from error
 
     def _run(self, log_sizes: dict[str, int] | None, resumed_at: int | None, notes: list[str]) -> RunResult:

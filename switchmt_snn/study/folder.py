@@ -17,8 +17,8 @@ import filelock
 
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError, SwitchMTError
-from switchmt_snn.runs.files import json_text, write_atomically
-from switchmt_snn.runs.folder import RunFolder, locked, unwritable
+from switchmt_snn.runs.files import json_text, write_atomically, writing
+from switchmt_snn.runs.folder import RunFolder, locked
 from switchmt_snn.study.grid import Study, Trial
 
 STUDIES = Path("runs") / "studies"
@@ -101,7 +101,7 @@ class StudyFolder:
             ConfigError: a trial that is here has another config, or is not in the study.
             RunFolderError: the folder holds something else, or cannot be written.
         """
-        try:
+        with writing(self.path, "--folder"):
             self.path.mkdir(parents=True, exist_ok=True)
             if self.is_study:
                 self._require_same(study)
@@ -119,8 +119,6 @@ class StudyFolder:
                 if not self.config(trial).is_file() or self.config(trial).read_bytes() != text:
                     write_atomically(self.config(trial), text)
             write_atomically(self.path / "trials.json", json_text(_listed(study), indent=1).encode())
-        except OSError as error:
-            raise RunFolderError(unwritable(self.path, error, "--folder")) from error
 
     def _require_same(self, study: Study) -> None:
         known = {trial.name: trial for trial in study.trials}
@@ -171,8 +169,13 @@ class StudyFolder:
         return locked(self.path, "study", "--folder")
 
     def note_attempt(self, attempt: Attempt) -> None:
-        """Append a line to attempts.jsonl."""
-        with (self.path / "attempts.jsonl").open("a", encoding="utf-8") as stream:
+        """Append a line to attempts.jsonl.
+
+        Raises:
+            WriteError: the system refused.
+        """
+        path = self.path / "attempts.jsonl"
+        with writing(path), path.open("a", encoding="utf-8") as stream:
             stream.write(json_text(vars(attempt)) + "\n")
 
     def attempts(self) -> list[Attempt]:

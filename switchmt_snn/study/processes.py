@@ -10,6 +10,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from switchmt_snn.runs.files import writing
+
 _PR_SET_PDEATHSIG = 1  # prctl.h of Linux
 _PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # found here: the new process only calls it
 
@@ -27,7 +29,7 @@ class ProgramProcess:
             python_path: PYTHONPATH in place of this process's own.
         """
         own = {} if python_path is None else {"PYTHONPATH": python_path}
-        with log.open("ab") as stream:
+        with writing(log), log.open("ab") as stream:
             self.process = subprocess.Popen(
                 _command_of(words),
                 stdin=subprocess.DEVNULL,

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.config.numbers import exact
-from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.files import json_text, write_atomically
 from switchmt_snn.study.figures import study_figures
 from switchmt_snn.study.folder import StudyFolder
@@ -43,13 +42,8 @@ def write_study_report(study: Study, folder: StudyFolder) -> Path | None:
         "scores.csv": _csv(SCORE_COLUMNS, (row for one in results for row in _score_rows(one))),
         "curves.csv": _csv(CURVE_COLUMNS, (row for one in results for row in _curve_rows(one))),
     }
-    try:
-        for name, text in contents.items():
-            write_atomically(folder.path / name, text.encode())
-    except OSError as error:
-        raise RunFolderError(
-            f"{folder.path} cannot be written ({error.strerror or error}), expected a writable folder"
-        ) from error
+    for name, text in contents.items():
+        write_atomically(folder.path / name, text.encode())
     groups = {name: [one.run for one in results if one.trial.variant == name] for name in study.variants}
     return write_comparison(
         {name: runs for name, runs in groups.items() if runs},

@@ -54,6 +54,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "profile": ("profile", "RUN", "--decisions", "8"),
     "play": ("play", "RUN", "--seconds", "0.5", "--fps", "10", "--out", "RUN/films/played.gif"),
     "report": ("report", "RUN", "--figures"),
+    "pack": ("pack", "RUN", "--out", "RUN/packed"),
     "study": ("study", "STUDY", "--folder", "RUN", "--jobs", "1"),
 }
 _EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.symlink"}
@@ -77,14 +78,29 @@ def run_until(argv: list[str], folder: Path, point: int | None) -> tuple[int, in
     Returns:
         Its exit code (``ENDED`` if it was ended), and the file operations that it had begun.
     """
+    code, operations = run_forked(argv, folder, lambda writing: _count_operations(str(folder), point, writing))
+    return code, int(operations or 0)
+
+
+def run_forked(argv: list[str], folder: Path, begin: Callable[[int], Callable[[], str]]) -> tuple[int, str]:
+    """Run a command in a fork; what it says goes to the end of ``folder``'s .log file, beside it.
+
+    Args:
+        argv: its words.
+        folder: where it works.
+        begin: called in the fork with a pipe; what the function says that it returns goes through the pipe at the end.
+
+    Returns:
+        Its exit code, and what came through the pipe.
+    """
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         try:
-            counted = _count_operations(str(folder), point, writing)
-            null = os.open(folder.parent / f"{folder.name}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-            os.dup2(null, 1)
-            os.dup2(null, 2)
+            ending = begin(writing)
+            log = os.open(folder.parent / f"{folder.name}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
             sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
             try:
                 main(argv)
@@ -92,7 +108,7 @@ def run_until(argv: list[str], folder: Path, point: int | None) -> tuple[int, in
                 code = int(ended.code or 0)
             sys.stdout.flush()
             sys.stderr.flush()
-            os.write(writing, f"{counted()}".encode())
+            os.write(writing, ending().encode())
             os._exit(code)
         except BaseException:
             import traceback
@@ -101,11 +117,11 @@ def run_until(argv: list[str], folder: Path, point: int | None) -> tuple[int, in
             os._exit(70)
     os.close(writing)
     with os.fdopen(reading) as stream:
-        operations = int(stream.read() or 0)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), operations
+        said = stream.read()
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), said
 
 
-def _count_operations(folder: str, point: int | None, writing: int) -> Callable[[], int]:
+def _count_operations(folder: str, point: int | None, writing: int) -> Callable[[], str]:
     seen = [0]
 
     def step() -> None:
@@ -133,7 +149,7 @@ def _count_operations(folder: str, point: int | None, writing: int) -> Callable[
 
     sys.addaudithook(hook)
     os.fsync = synced
-    return lambda: seen[0]
+    return lambda: str(seen[0])
 
 
 def prepared(command: str, folder: Path, finished: Path | None) -> None:

@@ -245,7 +245,7 @@ def test_an_out_that_cannot_be_written_to_is_refused_first(
 ) -> None:
     (tmp_path / "file").write_text("")
     _, err = run_command("profile", trained_run, "--out", tmp_path / "file" / "inside", code=2)
-    assert "cannot be written to" in err
+    assert "inside cannot be written (Not a directory)" in err
     assert not (trained_run / "recordings").exists()
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import re
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from switchmt_snn.runs.files import file_name, json_text, written_whole
+from switchmt_snn.errors import WriteError
+from switchmt_snn.runs.files import file_name, json_text, write_atomically, writing, written_whole
 from switchmt_snn.tasks.registry import SUITES
 
 TASKS = st.one_of(
@@ -55,6 +58,37 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
         failed.write_text("half \N{SNOWMAN}", "ascii")
     assert path.read_text() == "outer"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "remedy"),
+    [
+        (errno.ENOSPC, 1, "expected a disk that works and has room; then run the same command again"),
+        (errno.EIO, 1, "expected a disk that works and has room; then run the same command again"),
+        (errno.EACCES, 2, "expected a writable folder; name another with --out"),
+    ],
+)
+def test_what_the_system_refuses_names_the_file(number: int, code: int, remedy: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+
+    def fail() -> None:
+        with written_whole(path, "--out") as temporary:
+            temporary.write_text("half")
+            raise OSError(number, os.strerror(number), str(temporary))
+
+    with pytest.raises(WriteError) as refused:
+        fail()
+    assert str(refused.value) == f"{path} cannot be written ({os.strerror(number)}), {remedy}"
+    assert refused.value.exit_code == code
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_outer_writer_names_what_cannot_be_written(tmp_path: Path) -> None:
+    whole = tmp_path / "checkpoint"
+    with pytest.raises(WriteError, match=f"^{whole} cannot be written"), writing(whole):
+        write_atomically(tmp_path / "none" / "a.json", b"")
+    with pytest.raises(WriteError, match=r"a\.json cannot be written"):
+        write_atomically(tmp_path / "none" / "a.json", b"")
 
 
 def test_json_holds_no_number_that_json_does_not_know() -> None:

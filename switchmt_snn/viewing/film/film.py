@@ -191,19 +191,22 @@ def make_film(
             play = closing.enter_context(contextlib.closing(moments(agent, task, protocol, episodes)))
             lanes.append(Lane(agent, task, play, layout, rehearsal))
         size = canvas_size(len(tasks))
-        window = None if shown is None else shown(size, fps)
-        sink = None if out is None else open_sink(out, size, fps)
-        record = None if out is None else Record(*_beside(out), suite.action_names, tuple(rehearsal.order))
+        unfinished = closing.enter_context(contextlib.ExitStack())
+        window = sink = record = None
+        if shown is not None:
+            window = shown(size, fps)
+            unfinished.callback(window.discard)
+        if out is not None:
+            sink = open_sink(out, size, fps)
+            unfinished.callback(sink.discard)
+            record = Record(*_beside(out), suite.action_names, tuple(rehearsal.order))
+            unfinished.callback(record.discard)
         director = _Director(lanes, protocol, window, sink, record, note)
-        try:
-            with stop_requests() as stop:
-                director.run(most_frames, stop)
-        except BaseException:
-            for unfinished in (window, sink, record):
-                if unfinished is not None:
-                    unfinished.discard()
-            raise
-        return _finish(director, agent, out, fps)
+        with stop_requests() as stop:
+            director.run(most_frames, stop)
+        film = _finish(director, agent, out, fps)
+        unfinished.pop_all()
+        return film
 
 
 class _Director:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.errors import WriteError
+from switchmt_snn.runs.files import json_text, made, write_atomically, writing
 from switchmt_snn.viewing.film.moments import Moment
 from switchmt_snn.viewing.film.panels import Names
 
@@ -18,11 +20,13 @@ class Record:
 
     def __init__(self, csv_path: Path, json_path: Path, actions: tuple[str, ...], layers: tuple[str, ...]) -> None:
         self.csv_path, self.json_path = csv_path, json_path
-        csv_path.parent.mkdir(parents=True, exist_ok=True)
+        made(csv_path.parent, "--out")
         self._temporary = csv_path.with_name(f".{csv_path.name}.{os.getpid()}.tmp")
-        self._stream = self._temporary.open("w", encoding="utf-8", newline="")
+        with writing(csv_path, "--out"):
+            self._stream = self._temporary.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._stream)
-        self._writer.writerow(
+        self._layers = layers
+        self._write(
             [
                 *("frame", "task", "episode", "step", "action", "action_name", "random", "reward", "score", "ended"),
                 "value",
@@ -32,7 +36,6 @@ class Record:
                 *(f"rate_{name}" for name in layers),
             ]
         )
-        self._layers = layers
 
     def add(self, frame: int, names: Names, moment: Moment) -> None:
         """Write a task's row of a frame; numbers that do not exist (an action's, a value) are empty."""
@@ -40,7 +43,7 @@ class Record:
         advantage = insight.advantage_A
         empty = [""] * len(insight.q_A)
         spikes, rates = moment.spikes(), moment.rates()
-        self._writer.writerow(
+        self._write(
             [
                 *(frame, names.task, moment.episode, moment.step, moment.action, names.actions[moment.action]),
                 *(int(moment.random), _plain(moment.reward), _plain(moment.score), int(moment.ended is not None)),
@@ -52,17 +55,31 @@ class Record:
             ]
         )
 
+    def _write(self, row: list[Any]) -> None:
+        try:
+            with writing(self.csv_path):
+                self._writer.writerow(row)
+        except WriteError:
+            self.discard()
+            raise
+
     def close(self, facts: dict[str, Any]) -> None:
-        """Finish both files."""
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._stream.close()
-        self._temporary.replace(self.csv_path)
+        """Finish both files.
+
+        Raises:
+            WriteError: the system refused; call ``discard`` then.
+        """
+        with writing(self.csv_path):
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self._stream.close()
+            self._temporary.replace(self.csv_path)
         write_atomically(self.json_path, json_text(facts, indent=1).encode())
 
     def discard(self) -> None:
-        """Leave nothing."""
-        self._stream.close()
+        """Leave nothing that is not whole."""
+        with suppress(OSError):  # rows that were not written yet, on a full disk
+            self._stream.close()
         self._temporary.unlink(missing_ok=True)
 
 

@@ -13,6 +13,7 @@ from typing import Protocol
 from PIL import Image
 
 from switchmt_snn.errors import ConfigError, MissingExtraError, RunFolderError, TrainingFailed
+from switchmt_snn.runs.files import made, writing
 
 CODERS = {
     ".mp4": (
@@ -88,7 +89,8 @@ class VideoFile:
         if self._process.returncode:
             raise self._failed()
         self._closing.close()
-        self._temporary.replace(self._path)
+        with writing(self._path):
+            self._temporary.replace(self._path)
 
     def discard(self) -> None:
         """End ffmpeg and remove what it wrote."""
@@ -115,8 +117,7 @@ class FrameFolder:
         Raises:
             RunFolderError: it holds files, which frames would be mixed with.
         """
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
+        if any(made(folder, "--out").iterdir()):
             raise RunFolderError(
                 f"{folder} is not empty, expected a new or empty folder for frames; name another --out"
             )
@@ -124,8 +125,10 @@ class FrameFolder:
 
     def add(self, image: Image.Image) -> None:
         """Write a frame."""
-        image.save(self._folder / f"frame_{self._count:06}.png", compress_level=3)
+        path = self._folder / f"frame_{self._count:06}.png"
         self._count += 1
+        with writing(path):
+            image.save(path, compress_level=3)
 
     def close(self) -> None:
         """Every frame is on the disk."""
@@ -160,7 +163,7 @@ def open_sink(path: Path, size: tuple[int, int], fps: float) -> Sink:
     """A video file or a folder of frames, as the name says (``check_sink``)."""
     if path.suffix not in CODERS:
         return FrameFolder(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    made(path.parent, "--out")
     return VideoFile(path, size, fps)
 
 

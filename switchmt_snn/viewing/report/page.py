@@ -16,9 +16,8 @@ from switchmt_snn.drawing.marks import series_colour
 from switchmt_snn.drawing.numbers import compact, digits, duration
 from switchmt_snn.drawing.page import page_environment
 from switchmt_snn.drawing.svg import inline_svg
-from switchmt_snn.errors import RunFolderError
 from switchmt_snn.machine.progress import progress_of
-from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.runs.files import json_text, made, write_atomically
 from switchmt_snn.viewing.report.comparison import (
     Group,
     comparison_facts,
@@ -100,7 +99,7 @@ def write_comparison(
         The path of the page.
 
     Raises:
-        RunFolderError: the folder cannot be written.
+        WriteError: the folder cannot be written.
     """
     compared = [Group(label, tuple(runs)) for label, runs in groups.items()]
     charts = comparison_figures(compared)
@@ -121,26 +120,19 @@ def _write(
     figure_folder: str,
 ) -> Path:
     """The page, its JSON and its figures; returns the page's path."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / f"{name}.json", json_text(facts, indent=1).encode())
-        write_atomically(folder / f"{name}.html", page.encode())
-        if charts:
-            _write_figures(folder / figure_folder, charts)
-    except OSError as error:
-        raise RunFolderError(
-            f"{folder} cannot be written ({error.strerror or error}), expected a writable folder; name "
-            "another with --out"
-        ) from error
+    made(folder, "--out")
+    write_atomically(folder / f"{name}.json", json_text(facts, indent=1).encode(), "--out")
+    write_atomically(folder / f"{name}.html", page.encode(), "--out")
+    if charts:
+        _write_figures(made(folder / figure_folder, "--out"), charts)
     return folder / f"{name}.html"
 
 
 def _write_figures(folder: Path, charts: Sequence[Chart | Timeline]) -> None:
-    folder.mkdir(exist_ok=True)
     with progress_of("drawing", len(charts), "figures") as progress:
         for chart in charts:
             for name, content in figure_files([chart]).items():
-                write_atomically(folder / name, content)
+                write_atomically(folder / name, content, "--out")
             progress.advance()
 
 
