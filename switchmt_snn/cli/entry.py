@@ -85,14 +85,14 @@ def _main(argv: list[str]) -> int:
 def _called(name: str, options: list[str]) -> int:
     from switchmt_snn.errors import ConfigError, SwitchMTError, did_you_mean
     from switchmt_snn.machine.program import runnable
-    from switchmt_snn.viewing.output import json_only, speak_any_encoding
+    from switchmt_snn.viewing.output import each_warning_once, json_only, speak_any_encoding
 
     speak_any_encoding()
     try:
         if name not in COMMANDS:
             raise ConfigError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)}")
         command = import_module(f"switchmt_snn.cli.{name.replace('-', '_')}").command
-        with json_only() if "--json" in options else nullcontext():
+        with each_warning_once(), json_only() if "--json" in options else nullcontext():
             return int(command(options))
     except SwitchMTError as error:
         print(f"switchmt-snn: {runnable(str(error))}", file=sys.stderr)

@@ -38,7 +38,6 @@ ARGUMENTS = {
 }
 """The positional argument of each command, and what it is."""
 
-_ON_OR_OFF = "an option that is on or off takes no value: --recording.tensorboard, or --recording.no-tensorboard"
 _REGISTRY = ConstructorRegistry()
 
 
@@ -153,9 +152,9 @@ def split_one(kind: Any, argv: list[str], command: str, default: Any) -> tuple[s
     names, flags = split(kind, argv, command, default)
     if len(names) > 1:
         argument = ARGUMENTS[command][0]
-        hint = f"{_ON_OR_OFF}; " if names[-1].lower() in ("true", "false") else ""
+        hint = _on_or_off(kind, argv, default)
         raise ConfigError(
-            f"{command} got {' '.join(names)}, expected one {argument}; {hint}see switchmt-snn {command} --help"
+            f"{command} got {' '.join(names)}, expected one {argument}{hint}; see switchmt-snn {command} --help"
         )
     return names[0] if names else None, flags
 
@@ -281,7 +280,9 @@ def parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
         if stop.code == 0:
             raise
         unknown = _unknown_flags(kind, argv, command, default)
-        raise ConfigError(unknown or _one_line(complaint.getvalue(), command)) from None
+        text = unknown or _one_line(complaint.getvalue())
+        hint = _on_or_off(kind, argv, default)
+        raise ConfigError(f"{text}{hint}; see switchmt-snn {command} --help") from None
 
 
 def _renamed(word: str, renamed: dict[str, str]) -> str:
@@ -301,19 +302,26 @@ def _unknown_flags(kind: Any, argv: list[str], command: str, default: Any) -> st
             continue
         near = [settings[name] for name in meant(flag.removeprefix("--").replace("-", "_"), settings)]
         told.append(printable(flag) + (f" (did you mean {' or '.join(near)}?)" if near else ""))
-    if not told:
-        return ""
-    hint = f"; {_ON_OR_OFF}" if argv[-1].lower() in ("true", "false") else ""
-    return f"{command} has no option {', '.join(told)}{hint}; see switchmt-snn {command} --help"
+    return f"{command} has no option {', '.join(told)}" if told else ""
 
 
-def _one_line(boxed: str, command: str) -> str:
+def _on_or_off(kind: Any, argv: list[str], default: Any) -> str:
+    """What to write in place of ``--FLAG true`` and ``--FLAG=false``, where FLAG is on or off; nothing if none is."""
+    parser = tyro.extras.get_parser(kind, default=default, registry=_REGISTRY)
+    switches = {flag for action in parser._actions for flag in action.option_strings if action.nargs == 0}
+    for word, following in itertools.zip_longest(argv, argv[1:], fillvalue=""):
+        flag, equals, value = word.replace("_", "-").partition("=")
+        if flag in switches and (value if equals else following).lower() in ("true", "false"):
+            section, dot, name = flag.removeprefix("--").rpartition(".")
+            on, off = (f"--{section}{dot}{no}{name.removeprefix('no-')}" for no in ("", "no-"))
+            return f"; an option that is on or off takes no value: {on}, or {off}"
+    return ""
+
+
+def _one_line(boxed: str) -> str:
     """The message in tyro's box (drawn with lines in a UTF-8 terminal, with spaces elsewhere), without its title."""
     lines = [line.strip("│ ") for line in boxed.splitlines() if line.strip() and line[0] not in "╭╰"]
     if "│" not in boxed:
         lines = lines[1:]
     text = " ".join(line for line in lines if not set(line) <= set("─-"))
-    text = text.split("For full helptext")[0].split("Argument helptext")[0].strip().rstrip(".")
-    if text.lower().startswith("unrecognized options: ") and text.rpartition(" ")[2].lower() in ("true", "false"):
-        text += f"; {_ON_OR_OFF}"
-    return f"{text}; see switchmt-snn {command} --help"
+    return text.split("For full helptext")[0].split("Argument helptext")[0].strip().rstrip(".")

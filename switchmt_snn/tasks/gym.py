@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -106,7 +107,11 @@ def _copy(
     layout: FrameLayout,
 ) -> GymCopy:
     """A copy of an environment, also in a process that has not registered its id."""
+    module, _ = parse_id(name)
     if spec is not None:
+        with contextlib.suppress(ImportError):  # told below
+            if module is not None:  # first: registering an id again is a warning
+                import_plugin_module(module)
         gymnasium.registry.setdefault(spec.id, spec)
     return GymCopy(name, make_environment(name, wrappers, pictured), frame_shape, frame_dtype, layout.frame)
 

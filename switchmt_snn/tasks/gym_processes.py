@@ -7,11 +7,13 @@ copies in this process would play: the same ``GymCopy`` runs in them.
 from __future__ import annotations
 
 import contextlib
+import json
 import multiprocessing
 import signal
+import warnings
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, TextIO
 
 import gymnasium
 import numpy as np
@@ -66,14 +68,16 @@ class GymProcesses:
         for env_id, seed in zip(env_ids.tolist(), seeds.tolist(), strict=True):
             every[env_id] = seed
         with self._answers():
-            frames, _ = self._vector.reset(seed=every, options={"reset_mask": chosen})
+            frames, infos = self._vector.reset(seed=every, options={"reset_mask": chosen})
+        _warn_of(infos)
         found: Frames = frames[env_ids]
         return found
 
     def step(self, actions: npt.NDArray[np.int64]) -> VectorStep:
         """Step every copy."""
         with self._answers():
-            frames, rewards, terminated, truncated, _ = self._vector.step(actions)
+            frames, rewards, terminated, truncated, infos = self._vector.step(actions)
+        _warn_of(infos)
         return VectorStep(frames, rewards, terminated, truncated)
 
     def close(self) -> None:
@@ -121,23 +125,66 @@ def _nothing() -> None:
 
 
 class _Reporting(gymnasium.Wrapper[Any, int, Any, int]):
-    """A copy in a process of its own: an exception becomes its one line here, where its place is known."""
+    """A copy in a process of its own: an exception becomes its one line here, where its place is known.
 
-    def __init__(self, name: str, copy: GymCopy) -> None:
+    Warnings go to the main process, which shows each of them once; every process would.
+    """
+
+    def __init__(self, name: str, copy: GymCopy, heard: list[_Heard]) -> None:
         super().__init__(copy)
-        self._name = name
+        self._name, self._heard = name, heard
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         with task_code(self._name, "reset"):
-            return self.env.reset(seed=seed, options=options)
+            frame, _ = self.env.reset(seed=seed, options=options)
+        return frame, self._told()
 
     def step(self, action: int) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         with task_code(self._name, "step"):
-            return self.env.step(action)
+            frame, reward, terminated, truncated, _ = self.env.step(action)
+        return frame, reward, terminated, truncated, self._told()
+
+    def _told(self) -> dict[str, Any]:
+        if not self._heard:
+            return {}
+        told = {_WARNINGS: json.dumps(self._heard)}
+        self._heard.clear()
+        return told
 
 
 def _here(name: str, make: Callable[[], GymCopy]) -> _Reporting:
     """In a process of a copy: make it. Ctrl-C is for the main process, which ends the others."""
+    heard: list[_Heard] = []
     if multiprocessing.parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return _Reporting(name, make())
+
+        def hear(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            heard.append((str(message), filename, lineno))
+
+        warnings.showwarning = hear
+    return _Reporting(name, make(), heard)
+
+
+_WARNINGS = "warnings"
+"""In the info of a copy: what it was warned of, as JSON."""
+_Heard = tuple[str, str, int]
+"""A warning's text, file and line."""
+
+
+def _warn_of(infos: dict[str, Any]) -> None:
+    """Warn here of what the copies were warned of."""
+    for text, file, line in sorted(
+        {tuple(one) for told in infos.get(_WARNINGS, ()) if told for one in json.loads(told)}
+    ):
+        warnings.warn_explicit(text, UserWarning, file, line, registry=_shown)
+
+
+_shown: dict[str | tuple[str, type[Warning], int], int] = {}
+"""Where Python notes the warnings that were shown."""

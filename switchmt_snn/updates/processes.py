@@ -12,6 +12,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
 from datetime import timedelta
@@ -142,7 +143,11 @@ class Divided(Engine):
         for module in network.modules():
             if isinstance(module, TaskBatchNorm):
                 module.normalize = _normalize_over(group, module)  # type: ignore[method-assign]
-        differentiated = DistributedDataParallel(DifferentiatedPass(network, self.precision), broadcast_buffers=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 calls it forward_sync_buffers, 2.10 does not
+            differentiated = DistributedDataParallel(
+                DifferentiatedPass(network, self.precision), broadcast_buffers=False
+            )
         self._passes = forward_passes(network, target, differentiated, self.precision, config)
 
     def values(self, observations: Tensor, next_observations: Tensor, task: int, generator: torch.Generator) -> Values:

@@ -6,6 +6,7 @@ import codecs
 import contextlib
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -30,6 +31,31 @@ def speak_any_encoding() -> None:
         reconfigure: Any = getattr(stream, "reconfigure", None)
         if reconfigure is not None:
             reconfigure(errors="spelled")
+
+
+@contextlib.contextmanager
+def each_warning_once() -> Iterator[None]:
+    """Within it Python's warnings are shown once each; libraries make Python forget that it has shown them."""
+    seen: set[tuple[str, type[Warning]]] = set()
+    show = warnings.showwarning
+
+    def show_once(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if (str(message), category) not in seen:
+            seen.add((str(message), category))
+            show(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show_once
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
 
 
 _for_json: list[TextIO] = []

@@ -217,7 +217,10 @@ def test_train_then_evaluate_without_arguments(tmp_path: Path, capsys, monkeypat
         ),
         (["study", "policies_minatar", "--seeds"], "study got --seeds without a number, expected seeds"),
         (["train", "--recording.tensorboard=false"], "an option that is on or off takes no value"),
-        (["train", "cartpole", "--recording.tensorboard", "false"], "an option that is on or off takes no value"),
+        (
+            ["train", "cartpole", "--tasks.no-subprocesses", "false"],
+            "an option that is on or off takes no value: --tasks.subprocesses, or --tasks.no-subprocesses;",
+        ),
         (["train", "--run", "pretrained/pong"], "pretrained/pong comes with the package and holds weights only"),
         (["train", "pong", "--run", "pretrained/pong"], "training needs a new run: switchmt-snn train"),
         (["play", "pretrained/cartpole", "--task", "pong"], "unknown task 'pong'; known: CartPole-v1"),

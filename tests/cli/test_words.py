@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from switchmt_snn.config import ExperimentConfig, from_dict, load_config, preset
 from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.machine import program as names
-from switchmt_snn.viewing.output import FILE_COLUMNS, console
+from switchmt_snn.viewing.output import FILE_COLUMNS, console, each_warning_once
 from switchmt_snn.viewing.tables import evaluation_table, parity_table
 from tests.tasks.odd_envs import Plain
 
@@ -273,6 +274,19 @@ def test_a_table_of_parity_speaks_of_spikes_where_there_are_some(spiking: bool) 
     text = stream.getvalue()
     assert ("spike" in text) == ("flips:" in text) == spiking
     assert "every Q-value" in text
+
+
+def test_a_warning_is_shown_once_although_a_library_resets_pythons_memory(capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings():  # pytest's own record
+        warnings.resetwarnings()
+        warnings.showwarning = lambda message, *_: print(message)
+        with each_warning_once():
+            for text in ("a", "b", "a"):
+                warnings.warn(text, stacklevel=1)
+                with warnings.catch_warnings():
+                    pass
+        warnings.warn("a", stacklevel=1)
+    assert capsys.readouterr().out.split() == ["a", "b", "a"]
 
 
 def test_a_study_is_continued_as_it_was_begun() -> None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,22 @@ def test_an_interrupt_while_the_processes_start_ends_those_that_have(monkeypatch
         suite_of("CartPole-v1").make(0, 1)
     assert seen == [(before + 1, True)]
     assert len(multiprocessing.active_children()) == before
+
+
+def test_a_warning_of_the_copies_is_heard_here_once(capfd: pytest.CaptureFixture[str]) -> None:
+    """DoubleObservation gives lists, of which Gymnasium's checker warns; nothing warns of the registered id."""
+    tasks = suite_of(f"{ODD}:DoubleObservation-v0")
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            play = Play(tasks, 0, 2)
+            play.begin(np.arange(2), np.arange(2))
+            play.step(np.zeros(2, np.int64))
+            play.close()
+    told = [str(one.message) for one in heard if Path(one.filename).name == "passive_env_checker.py"]
+    assert len(told) == len(set(told)) == 2  # of reset and of step
+    assert not [one for one in heard if "already in registry" in str(one.message)]
+    assert "Warning" not in capfd.readouterr().err
 
 
 def test_other_suites_refuse_it() -> None:
