@@ -22,6 +22,12 @@ class TasksConfig:
     """Where names are looked up: atari, minatar, gym (Gymnasium ids), or package.module:Name, a Suite of your own."""
     names: tuple[str, ...] = ("pong", "breakout", "enduro")
     """Tasks in the order in which training visits them. In the gym suite, module:MyEnv-v0 imports module first."""
+    later_names: tuple[str, ...] = ()
+    """Tasks that change midway: what each of ``names`` is from ``later_from_steps`` on, its own name where it stays as
+    it is. Names, outputs and replays stay; actions must be the same. Empty: no task changes."""
+    later_from_steps: int | None = None
+    """Agent steps of the run after which ``later_names`` are played, and evaluated. Episodes of tasks that change are
+    cut off there."""
     wrappers: tuple[str, ...] = ()
     """gym suite: wrappers of every environment, the innermost first. FlattenObservation: Dict, Tuple and Discrete
     observations become vectors. FlattenAction: one action for every combination of a MultiDiscrete space. module:Name:
@@ -57,6 +63,7 @@ class TasksConfig:
         require_suite_name(self.suite)
         require(len(self.names) > 0, "tasks.names", self.names, "at least one task")
         require(len(set(self.names)) == len(self.names), "tasks.names", self.names, "every task once")
+        self._require_change()
         for name in self.wrappers:
             require(
                 name in BUILT_IN_WRAPPERS or is_plugin(name),
@@ -79,6 +86,29 @@ class TasksConfig:
         require(0.0 <= p < 1.0, "tasks.sticky_action_probability", p, "a probability in [0, 1)")
         require(self.noop_max >= 0, "tasks.noop_max", self.noop_max, "at least 0")
         require(self.max_episode_frames >= 1, "tasks.max_episode_frames", self.max_episode_frames, "at least 1")
+
+    def _require_change(self) -> None:
+        later, start = self.later_names, self.later_from_steps
+        require(
+            len(later) in (0, len(self.names)),
+            "tasks.later_names",
+            later,
+            f"one name for each of tasks.names ({len(self.names)}), or none",
+        )
+        require(
+            not later or later != self.names,
+            "tasks.later_names",
+            later,
+            "another name for one task at least",
+            "leave it out where no task changes",
+        )
+        require(
+            (start is None) == (not later),
+            "tasks.later_from_steps",
+            start,
+            "null without tasks.later_names" if not later else "the step from which tasks.later_names are played",
+        )
+        require(start is None or start >= 1, "tasks.later_from_steps", start, "at least 1")
 
 
 def resolved_frame_stack(tasks: TasksConfig) -> int:

@@ -46,6 +46,10 @@ class ReturnScale(Stateful):
         self.count += len(running_L)
         self.running_L = np.where(over_L, 0.0, running_L)
 
+    def end(self) -> None:
+        """The running returns of all copies end here."""
+        self.running_L = np.zeros_like(self.running_L)
+
     @property
     def value(self) -> float:
         """The scale; 1 while no reward was seen."""

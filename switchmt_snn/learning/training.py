@@ -135,6 +135,7 @@ class Training(Stateful):
             yield from self._end_episodes(play, played, epsilon)  # terminal: H_i, Eq. 3, maybe i <- i + 1 mod |E|
             if self.config.learning.target_update_every_updates is None:
                 self._copy_target(passed=self.num_envs)
+            self._change_tasks()
             if self.metrics_clock.advance(self.num_envs):
                 yield self.measure()
             yield Stepped(self.steps, task, epsilon, warming_up)
@@ -323,8 +324,21 @@ class Training(Stateful):
 
     def _play(self, task: int) -> Play:
         if task not in self._plays:
-            self._plays[task] = Play(self.suite, task, self.num_envs)
+            self._plays[task] = Play(self.suite.at(self.steps), task, self.num_envs)
         return self._plays[task]
+
+    def _change_tasks(self) -> None:
+        """At ``tasks.later_from_steps``: the running episodes of tasks that change are cut off, others go on."""
+        now, later = self.suite.at(self.steps), self.suite.later
+        if later is None or now is self.suite:
+            return
+        for task in [task for task in later.changed if task in self._plays and self._plays[task].suite is not now]:
+            self._plays.pop(task).close()
+            for env in range(self.num_envs):
+                self.exploration.end(task, env)
+            if self.return_scales:
+                self.return_scales[task].end()
+        self._begin_episodes()
 
     def measure(self) -> Measured:
         """Means since the last report and the health of every neuron layer on the current task.

@@ -350,10 +350,11 @@ class _Driver:
     def _evaluate(self, settings: EvaluationConfig, stop: Callable[[], bool] | None = None) -> Evaluation:
         training = self.training
         learner = training.learner
-        agent = Agent(learner.acting_network, training.suite, self.config, learner.device, training.steps)
+        suite = training.suite.at(training.steps)
+        agent = Agent(learner.acting_network, suite, self.config, learner.device, training.steps)
         protocol = EvaluationProtocol.of(settings, self.config.tasks)
         self._note(f"evaluating: {protocol}")
-        known = RandomPlay(self.folder.path, self.config, training.suite, protocol)
+        known = RandomPlay(self.folder.path, self.config, suite, protocol)
         evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop, random_play=known)
         self.folder.save_evaluation(evaluation)
         self.best.at_evaluation(evaluation, agent.network)
@@ -400,7 +401,7 @@ def load_agent(
     network = build_network(config.network, observation_spec(suite), config.seed)
     with fitting_weights():
         network.load_state_dict(weights)
-    return Agent(network, suite, config, select_device(device), step)
+    return Agent(network, suite.at(step), config, select_device(device), step)
 
 
 def evaluate(

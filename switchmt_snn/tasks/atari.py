@@ -15,6 +15,7 @@ from switchmt_snn.config import TasksConfig, resolved_frame_stack
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.atari_scores import ATARI_REFERENCES, PUBLISHED_SCORES
+from switchmt_snn.tasks.changing import all_names
 from switchmt_snn.tasks.suite import Picture, Suite, TaskEnvironment, TaskSuite, VectorStep
 
 SIDE_PIXELS = 84
@@ -170,7 +171,7 @@ class AtariSuite(Suite):
     @property
     def files(self) -> dict[str, Path]:
         """The ROMs."""
-        return {name: Path(roms.get_rom_path(name)) for name in self.config.names}
+        return {name: Path(roms.get_rom_path(name)) for name in all_names(self.config)}
 
     def make(self) -> TaskSuite:
         """Make the games.

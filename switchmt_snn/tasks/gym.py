@@ -16,6 +16,7 @@ from switchmt_snn.config import resolved_frame_stack
 from switchmt_snn.config.plugins import import_plugin_module, is_plugin
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
+from switchmt_snn.tasks.changing import all_names
 from switchmt_snn.tasks.gym_copies import GymCopies, GymCopy, first_action, is_outside
 from switchmt_snn.tasks.gym_make import make_environment, parse_id
 from switchmt_snn.tasks.gym_processes import GymProcesses
@@ -41,7 +42,7 @@ class GymSuite(Suite):
     @property
     def files(self) -> dict[str, Path]:
         """The modules that tasks and wrappers name before a colon."""
-        modules = [parse_id(name)[0] for name in self.config.names]
+        modules = [parse_id(name)[0] for name in all_names(self.config)]
         modules += [name.partition(":")[0] for name in self.config.wrappers if is_plugin(name)]
         named = [module for module in dict.fromkeys(modules) if module is not None]
         files = {module: getattr(import_plugin_module(module), "__file__", None) for module in named}

@@ -193,8 +193,9 @@ def first_action(env: Env) -> int:
 
 
 def is_outside(env: Env) -> bool:
-    """Whether an environment, or one of its wrappers, comes from another package than Gymnasium and MinAtar."""
-    return any(type(layer).__module__.partition(".")[0] not in ("gymnasium", "minatar") for layer in _layers(env))
+    """Whether an environment, or one of its wrappers, is neither of this package nor of Gymnasium or MinAtar."""
+    inside = ("gymnasium", "minatar", "switchmt_snn")
+    return any(type(layer).__module__.partition(".")[0] not in inside for layer in _layers(env))
 
 
 def _layers(env: Env) -> list[Env]:

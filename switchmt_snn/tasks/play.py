@@ -35,7 +35,7 @@ class Play:
     """
 
     def __init__(self, suite: TaskSuite, task: int, num_envs: int) -> None:
-        self.task = task
+        self.suite, self.task = suite, task
         self.num_envs = num_envs
         self._environment = CheckedEnvironment(suite, task, num_envs)
         self._channels = suite.frame_shape[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 from switchmt_snn.config import SuiteDefaults, TasksConfig
@@ -10,6 +11,7 @@ from switchmt_snn.config.plugins import is_plugin, load_plugin, plugin_name
 from switchmt_snn.config.suites import register_defaults, require_suite_name
 from switchmt_snn.errors import ConfigError, TaskError, did_you_mean
 from switchmt_snn.tasks.atari import AtariSuite
+from switchmt_snn.tasks.changing import all_names, changing
 from switchmt_snn.tasks.facts import is_outside, require_facts, require_tasks, suite_code
 from switchmt_snn.tasks.gym import GymSuite
 from switchmt_snn.tasks.minatar import MinAtarSuite
@@ -68,13 +70,21 @@ def suite_of(config: TasksConfig) -> Suite:
 
 
 def make_suite(config: TasksConfig) -> TaskSuite:
-    """Make the tasks that a config names.
+    """Make the tasks that a config names; with ``tasks.later_names`` they know what they become (``TaskSuite.at``).
 
     Raises:
         ConfigError: unknown suite, or one that does not follow ``tasks.minimal_action_mask`` or ``tasks.wrappers``.
         TaskError: a task is unknown, does not fit a Q-network, or is not what its suite says.
         MissingExtraError: the suite needs an optional package.
     """
+    if not config.later_names:
+        return _made(config)
+    both = replace(config, names=all_names(config), later_names=(), later_from_steps=None)
+    return changing(_made(both), config)
+
+
+def _made(config: TasksConfig) -> TaskSuite:
+    """The tasks of a config in which none changes."""
     suite = suite_of(config)
     with suite_code(type(suite), config.suite, "known_tasks"):
         known = suite.known_tasks()

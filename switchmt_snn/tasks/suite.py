@@ -87,6 +87,21 @@ class Reference:
 
 
 @dataclass(frozen=True)
+class Later:
+    """What tasks become midway.
+
+    Attributes:
+        from_steps: agent steps of the run after which they are so.
+        tasks: under the names, with the outputs and frames of the earlier ones.
+        changed: indices of those that are another task than before.
+    """
+
+    from_steps: int
+    tasks: TaskSuite
+    changed: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class TaskSuite:
     """Tasks in order, and what they share.
 
@@ -108,6 +123,7 @@ class TaskSuite:
             Random play is then kept beside a run and not played again. Default: no.
         make_pictured: as ``make``, of environments that can be drawn: the same play for the same seeds and actions.
             None if there are no pictures.
+        later: what the tasks become midway (``tasks.later_names``); a suite's ``make`` leaves it None.
     """
 
     names: tuple[str, ...]
@@ -125,10 +141,15 @@ class TaskSuite:
     thread_safe: bool = False
     versioned: bool = False
     make_pictured: Callable[[int, int], PicturedEnvironment] | None = None
+    later: Later | None = None
 
     def pictured(self) -> TaskSuite:
         """These tasks in environments that can be drawn (``Play.picture``), as far as they have pictures."""
         return self if self.make_pictured is None else replace(self, make=self.make_pictured)
+
+    def at(self, step: int) -> TaskSuite:
+        """The tasks as they are after so many agent steps of a run."""
+        return self.later.tasks if self.later is not None and step >= self.later.from_steps else self
 
     def first_action(self, task: int) -> int:
         """The number by which a task's environment calls action 0."""

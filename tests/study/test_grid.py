@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -206,3 +207,15 @@ def test_an_unknown_study_is_named_with_the_nearest() -> None:
         load_study("policies_minata")
     with pytest.raises(ConfigError, match="no study 'xxx"):
         load_study("x" * 5000)
+
+
+def test_the_docs_name_the_studies_of_the_package_with_their_sizes() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "studies.md").read_text()
+    stated = {name: (int(variants), int(seeds)) for name, variants, seeds in _SIZES.findall(text)}
+    found = {name: load_study(name) for name in studies()}
+    assert stated == {
+        name: (len(study.variants), len({trial.seed for trial in study.trials})) for name, study in found.items()
+    }
+
+
+_SIZES = re.compile(r"^\| `(\w+)` \| .* \| (\d+) variants, (\d+) seeds \|$", re.MULTILINE)
