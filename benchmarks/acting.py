@@ -23,7 +23,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config, resolve
 from switchmt_snn.export import to_onnx
 from switchmt_snn.export.runtimes.agents import OnnxAgent
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.spiking.network import build_network, trainable_parameters
 from switchmt_snn.tasks.registry import make_suite
 

@@ -20,7 +20,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config, resolve
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.replay.ring import FrameReplay, Returns
 from switchmt_snn.runs.run import load_agent

@@ -41,7 +41,7 @@ from benchmarks.measure import (
 from benchmarks.peers import ACTIONS, PlainLoop, spikingjelly_network
 from switchmt_snn.config import ExperimentConfig, load_config, resolve
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.native import library as native_library
 from switchmt_snn.native.supports import spikes_as_bits

@@ -16,7 +16,7 @@ from switchmt_snn.export.chips.mappings import CorePerLayer
 from switchmt_snn.export.chips.rules import RULES
 from switchmt_snn.export.energy.estimate import TARGETS, Target
 from switchmt_snn.export.folded import fold_agent
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite
 

@@ -22,19 +22,16 @@ from switchmt_snn.errors import TrainingFailed, require_saved
 from switchmt_snn.learning.clocks import Every, linear_decay
 from switchmt_snn.learning.events import EpisodeEnded, Event, Measured, Stepped, SwitchDecided
 from switchmt_snn.learning.exploration import Exploration
-from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.measuring import layer_health, updates_to_settle
+from switchmt_snn.learning.parts import make_learner, make_replay
 from switchmt_snn.learning.return_scale import make_return_scales
 from switchmt_snn.learning.saved_values import require_sound
-from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.learning.statistics import reestimate_statistics
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
-from switchmt_snn.machine.memory import GIB
 from switchmt_snn.replay.on_device import to_device
-from switchmt_snn.replay.ring import FrameReplay, Returns
-from switchmt_snn.replay.size import compresses_replay
-from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
+from switchmt_snn.replay.ring import Returns
+from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite, VectorStep
 from switchmt_snn.updates.processes import ProcessGroup
@@ -408,45 +405,3 @@ class Training(Stateful):
         for play in self._plays.values():
             play.close()
         self.learner.close()
-
-
-def observation_spec(suite: TaskSuite) -> ObservationSpec:
-    """What the network must know of a suite."""
-    return ObservationSpec(
-        shape=suite.observation_shape,
-        frame_stack=suite.frame_stack,
-        scale=suite.scale,
-        in_unit_range=suite.in_unit_range,
-        num_actions=suite.num_actions,
-        num_tasks=len(suite.names),
-    )
-
-
-def make_learner(
-    config: ExperimentConfig, suite: TaskSuite, device: torch.device, group: ProcessGroup | None = None
-) -> Learner:
-    """A run's learner with a fresh network.
-
-    It is the same in every process of a group, except for the random numbers of the encoding.
-    """
-    network_seed, _, _, encode_seed = np.random.SeedSequence(config.seed).spawn(4)
-    network = build_network(config.network, observation_spec(suite), int(network_seed.generate_state(1)[0]))
-    encode = int(encode_seed.generate_state(1)[0]) + (0 if group is None else group.rank)
-    if group is None:
-        return Learner(network, config.learning, suite.valid_actions_KA, device, encode)
-    return SharedLearner(network, config.learning, suite.valid_actions_KA, device, encode, group)
-
-
-def make_replay(config: ExperimentConfig, suite: TaskSuite, device: torch.device) -> FrameReplay:
-    """The empty replay memory D of one task."""
-    learning = config.learning
-    return FrameReplay(
-        learning.replay_capacity_steps,
-        config.tasks.num_envs,
-        suite.frame_shape,
-        suite.frame_dtype,
-        suite.frame_stack,
-        compresses_replay(config, suite),
-        int(learning.replay_max_gib * GIB / len(suite.names)),
-        device if learning.replay_on_device else None,
-    )

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 from switchmt_snn.config import METHOD_TRAITS, METHODS, ExperimentConfig, resolve
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.runs.memory import MemoryEstimate, estimate_memory
 from switchmt_snn.spiking.folding import network_nodes
 from switchmt_snn.spiking.layers import SynapseNode

@@ -13,7 +13,7 @@ from torch import Tensor
 from switchmt_snn.config import ExperimentConfig, differences
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.learning.learner import Learner
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.folder import read_environment
 from switchmt_snn.runs.packing import open_run, pretrained_names

@@ -17,9 +17,10 @@ from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, l
 from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import CheckpointError, TrainingFailed, WriteError
 from switchmt_snn.learning.events import Event, Stepped
+from switchmt_snn.learning.parts import make_learner, observation_spec
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.switching import Criterion, with_policy
-from switchmt_snn.learning.training import Training, make_learner, observation_spec
+from switchmt_snn.learning.training import Training
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.best import BestWeights

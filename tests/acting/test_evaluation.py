@@ -27,7 +27,7 @@ from switchmt_snn.export.folded import fold_agent, metadata
 from switchmt_snn.export.formats.files import nir_graphs
 from switchmt_snn.export.formats.onnx_writer import decision_model
 from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.machine.cores import Parts, parts
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.atari import AtariSuite

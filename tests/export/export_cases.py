@@ -11,7 +11,7 @@ import torch
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import METHODS, resolve
 from switchmt_snn.config.yaml_io import from_dict
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 from switchmt_snn.tasks.registry import make_suite

@@ -29,7 +29,8 @@ from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.export.recording import read_recording
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.learning.events import Stepped
-from switchmt_snn.learning.training import Training, observation_spec
+from switchmt_snn.learning.parts import observation_spec
+from switchmt_snn.learning.training import Training
 from switchmt_snn.runs.checkpoint import CheckpointStore, fitting_state, fitting_weights
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.files import file_name, sha256

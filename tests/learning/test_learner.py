@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from switchmt_snn.learning.learner import Learner, td_target
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.native import library as native_library
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import build_network

@@ -13,7 +13,7 @@ from switchmt_snn import evaluate, load_agent, train
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import ConfigError
 from switchmt_snn.learning.learner import Learner, quantile_huber_loss, td_target
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.spiking.network import build_network
 from tests.conftest import SameObservationEnvironment, small_config, vector_suite

@@ -13,7 +13,7 @@ import zstandard
 
 from switchmt_snn.config import load_config, resolve
 from switchmt_snn.errors import CheckpointError
-from switchmt_snn.learning.training import make_replay
+from switchmt_snn.learning.parts import make_replay
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.files import sha256
 from switchmt_snn.runs.manifest import seal

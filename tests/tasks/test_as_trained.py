@@ -12,7 +12,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import EvaluationProtocol, evaluate_agent
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.errors import TaskError
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.as_trained import TaskAsTrained
 from switchmt_snn.tasks.play import episode_seed

@@ -16,7 +16,7 @@ import torch
 from switchmt_snn.config import ExperimentConfig, SuiteDefaults, TasksConfig, resolve
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import ConfigError, TaskError
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.check import check_before_training, check_suite

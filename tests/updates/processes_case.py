@@ -10,8 +10,8 @@ import torch
 
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.learning.learner import Learner
+from switchmt_snn.learning.parts import make_learner
 from switchmt_snn.learning.shared_learner import SharedLearner
-from switchmt_snn.learning.training import make_learner
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.updates.processes import ProcessGroup, join_processes

@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.learning.training import make_learner
+from switchmt_snn.learning.parts import make_learner
 from switchmt_snn.tasks.registry import make_suite
 from tests.conftest import decided, small_config
 from tests.runs.test_resume import CONFIG, content

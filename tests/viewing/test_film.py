@@ -31,7 +31,7 @@ from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.activity import active_neurons
 from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent, onnx_session
 from switchmt_snn.export.watching import Watched, trace_network, tracer_of_nir, tracer_of_onnx
-from switchmt_snn.learning.training import observation_spec
+from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import make_suite
