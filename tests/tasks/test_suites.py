@@ -376,7 +376,7 @@ class NoSpace(Still):
         (Still, None),
         (ShortFrame, r"gave an observation of shape \(2,\), expected \(3,\), the shape of its observation_space"),
         (FourValues, r"fails in step \(ValueError: .*truncated, info\)"),
-        (NoInfo, r"fails in reset \(ValueError: .*expected reset\(.*\(observation, info\)"),
+        (NoInfo, r"gave array\(.*\) from reset, expected \(observation, info\)"),
         (NoSpace, "observ"),
     ],
 )
