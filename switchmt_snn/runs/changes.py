@@ -6,13 +6,12 @@ and ``conditions`` with the new values of those that differ.
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 from switchmt_snn.errors import RunFolderError, reason_of
-from switchmt_snn.runs.files import json_text, write_atomically
+from switchmt_snn.runs.files import json_text, parsed_json, write_atomically
 from switchmt_snn.runs.folder import read_environment
 
 CONDITIONS = ("python", "processor", "torch_threads", "device", "device_name")
@@ -42,7 +41,7 @@ def note_changes(folder: Path, environment: dict[str, Any], step: int) -> list[s
     try:
         begun = read_environment(folder)
         known = {"files_sha256": dict(begun.get("files_sha256", {})), "conditions": conditions(begun)}
-        rows = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
+        rows = [parsed_json(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
         for row in rows:
             for kind, values in known.items():
                 values |= row.get(kind, {})

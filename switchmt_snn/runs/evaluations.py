@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -18,7 +17,7 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol
 from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.numbers import exact
 from switchmt_snn.errors import ConfigError, RunFolderError, reason_of
-from switchmt_snn.runs.files import file_name, json_text, made, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, made, parsed_json, write_atomically
 
 CLEARLY_ABOVE = 1.96
 """Standard errors of the difference of two means by which an agent must lead random play to be called better."""
@@ -120,7 +119,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         if not path.is_file():
             raise ValueError("it is no plain file")
-        stored = dict(json.loads(path.read_bytes()))
+        stored = dict(parsed_json(path.read_bytes()))
         stored = {
             "step": _count(stored["step"]),
             "protocol": dict(stored["protocol"]),

@@ -55,6 +55,20 @@ def json_text(value: Any, indent: int | None = None) -> str:
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
+def parsed_json(content: bytes | str) -> Any:
+    """The value of JSON in UTF-8. ``json.loads`` also takes halves of characters, which no page can hold.
+
+    Raises:
+        ValueError: it is no JSON, no UTF-8, or has a text with half of a character.
+        RecursionError: it is too deep.
+    """
+    text = content if isinstance(content, str) else content.decode()
+    value = json.loads(text)
+    if "\\u" in text:
+        json.dumps(value, ensure_ascii=False).encode()
+    return value
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-import json
 import shlex
 import time
 from dataclasses import replace
@@ -23,7 +22,7 @@ from switchmt_snn.config.bounds import LARGEST
 from switchmt_snn.errors import ConfigError, RunFolderError, WriteError, nearest
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
-from switchmt_snn.runs.files import json_text, write_atomically, writing
+from switchmt_snn.runs.files import json_text, parsed_json, write_atomically, writing
 
 RUNS = Path("runs")
 LOCK = {"run.lock"}
@@ -91,7 +90,7 @@ def read_environment(run: Path) -> dict[str, Any]:
     """
     path = run / "environment.json"
     try:
-        facts = json.loads(path.read_bytes()) if path.is_file() else None
+        facts = parsed_json(path.read_bytes()) if path.is_file() else None
     except (OSError, ValueError, RecursionError):
         facts = None
     if not isinstance(facts, dict):

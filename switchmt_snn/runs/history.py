@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any, TypeVar
 from switchmt_snn.errors import RunFolderError, reason_of
 from switchmt_snn.learning.events import EpisodeEnded, LayerHealth, Measured
 from switchmt_snn.learning.switching import DECISION_COLUMNS
+from switchmt_snn.runs.files import parsed_json
 
 _T = TypeVar("_T")
 _MOST = 2**62
@@ -111,7 +111,7 @@ def read_history(folder: Path, task_names: tuple[str, ...]) -> History:
         return ended, Clocked(ended.step, _finite(row["wall_s"]))
 
     def measurement(line: str) -> tuple[Measured, Clocked, dict[str, int]]:
-        row = dict(json.loads(line))
+        row = dict(parsed_json(line))
         measured = Measured(
             step=_count(row["step"]),
             task=task_names.index(row["task"]),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.errors import CheckpointError, shown
-from switchmt_snn.runs.files import sha256
+from switchmt_snn.runs.files import parsed_json, sha256
 
 FORMAT = 4
 """Goes up when a saved state gets another shape. 2: paused episodes of every task. 4: model.safetensors may be Q*."""
@@ -63,7 +63,7 @@ def read_json(content: bytes, name: str) -> Any:
     if len(content) > MOST_BYTES:
         raise CheckpointError(f"{name} has {len(content):,} bytes, expected at most {MOST_BYTES:,}")
     try:
-        return json.loads(content)
+        return parsed_json(content)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{name} is not JSON") from error
 

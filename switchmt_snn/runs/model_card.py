@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import METHOD_TRAITS, ExperimentConfig
 from switchmt_snn.drawing.numbers import bytes_of, digits, duration, percent, whole
 from switchmt_snn.runs.evaluations import better_than_random
-from switchmt_snn.runs.files import sha256
+from switchmt_snn.runs.files import parsed_json, sha256
 from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, read_history
 
@@ -162,7 +161,7 @@ def _profile(run: RunFolder, step: int) -> dict[str, Any] | None:
     path = run.path / "profile" / "profile.json"
     if not path.is_file():
         return None
-    facts = dict(json.loads(path.read_bytes()))
+    facts = dict(parsed_json(path.read_bytes()))
     return facts if facts.get("training_step") == step else None
 
 
@@ -235,7 +234,7 @@ def _hash_lines(run: RunFolder, step: int, environment: Mapping[str, Any], files
     checkpoints = run.path / "checkpoints"
     for folder in (checkpoints / f"step-{step:012d}", checkpoints / "best"):
         weights = folder / "model.safetensors"
-        if weights.is_file() and json.loads((folder / "manifest.json").read_bytes())["step"] == step:
+        if weights.is_file() and parsed_json((folder / "manifest.json").read_bytes())["step"] == step:
             name = weights.relative_to(run.path).as_posix()
             lines.append(_hash_line(f"{name} (trained weights)", weights.read_bytes()))
             break

@@ -26,7 +26,7 @@ from switchmt_snn.acting.episodes import EpisodeScore
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.runs.environment import processor
-from switchmt_snn.runs.files import file_name, json_text, made, sha256, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, made, parsed_json, sha256, write_atomically
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -53,7 +53,7 @@ class RandomPlay:
             return None
         facts, path = self._of(task)
         try:
-            stored = json.loads(path.read_bytes())
+            stored = parsed_json(path.read_bytes())
             episodes = [EpisodeScore(**episode) for episode in stored["episodes"]]
         except (OSError, ValueError, KeyError, TypeError):
             return None

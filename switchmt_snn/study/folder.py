@@ -6,7 +6,6 @@ and what the report writes: tables.md  study.json  trials.csv  scores.csv  decis
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -17,7 +16,7 @@ import filelock
 
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
 from switchmt_snn.errors import ConfigError, RunFolderError, SwitchMTError
-from switchmt_snn.runs.files import json_text, write_atomically, writing
+from switchmt_snn.runs.files import json_text, parsed_json, write_atomically, writing
 from switchmt_snn.runs.folder import RunFolder, locked
 from switchmt_snn.study.grid import Study, Trial
 
@@ -146,7 +145,7 @@ class StudyFolder:
         self.require()
         path = self.path / "trials.json"
         try:
-            stored = json.loads(path.read_bytes())
+            stored = parsed_json(path.read_bytes())
             trials = tuple(
                 Trial(
                     name=str(one["name"]),
@@ -187,7 +186,7 @@ class StudyFolder:
         path = self.path / "attempts.jsonl"
         text = path.read_text("utf-8") if path.is_file() else ""
         try:
-            return [Attempt(**json.loads(line)) for line in text[: text.rfind("\n") + 1].splitlines()]
+            return [Attempt(**parsed_json(line)) for line in text[: text.rfind("\n") + 1].splitlines()]
         except (ValueError, TypeError) as error:
             raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected the study's attempts") from error
 
@@ -282,7 +281,7 @@ def _last_logged(path: Path) -> int:
     for name in ("episodes.csv", "metrics.jsonl"):
         for line in reversed(_last_lines(path / name)):
             try:
-                steps.append(int(json.loads(line)["step"] if name.endswith("jsonl") else line.split(",", 1)[0]))
+                steps.append(int(parsed_json(line)["step"] if name.endswith("jsonl") else line.split(",", 1)[0]))
                 break
             except (ValueError, KeyError, TypeError):
                 continue  # the header, or part of a line
