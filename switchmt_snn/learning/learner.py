@@ -20,6 +20,7 @@ from switchmt_snn.config import LearningConfig
 from switchmt_snn.errors import ConfigError, require_saved
 from switchmt_snn.learning.clocks import linear_decay
 from switchmt_snn.learning.first_layer import FirstLayerMeans
+from switchmt_snn.learning.saved_values import require_like
 from switchmt_snn.learning.state import Stateful
 from switchmt_snn.replay.on_device import to_device
 from switchmt_snn.replay.ring import Batch
@@ -262,7 +263,11 @@ class Learner(Stateful):
         require_saved(state, (*self.SAVED, *first_layer), type(self).__name__)
         optimizer = state["optimizer"]
         require_saved(optimizer, ("state", "param_groups"), f"the optimizer of {type(self).__name__}")
-        numbered = {int(number): values for number, values in optimizer["state"].items()}
+        require_like({}, optimizer["state"], f"state of the optimizer of {type(self).__name__}")
+        numbered = {
+            int(number) if len(str(number)) < 10 and str(number).isdecimal() else number: values
+            for number, values in optimizer["state"].items()
+        }
         state = {**state, "optimizer": {**optimizer, "state": numbered}}
         super().load_state_dict(state)
         if self.first_layer is not None:

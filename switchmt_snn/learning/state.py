@@ -108,6 +108,8 @@ def _unpacked(current: Any, saved: Any, name: str) -> Any:
             current.load_state_dict(saved)
         return current
     if hasattr(current, "load_state_dict"):
+        if isinstance(current, torch.nn.Module) and not isinstance(saved, dict):
+            raise _unfitting(name, _kind(saved), "a dict of its parameters")
         current.load_state_dict(saved)
         return current
     if isinstance(current, torch.Tensor):  # stays on its device

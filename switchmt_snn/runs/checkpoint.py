@@ -264,25 +264,24 @@ class CheckpointStore:
                 f"{path} holds weights only (a packed run), expected a run with its replay; it can be evaluated, "
                 "exported and profiled, but training needs a new run: --run NEW_FOLDER"
             )
-        with fitting_state():
-            model = _read_tensors(path, _MODEL_FILE, manifest)
-            training = _read_tensors(path, "training.safetensors", manifest)
-            tree = read_json(_read_file(path, "state.json", manifest), "state.json")
-            state = join(tree, model, training, MODEL_PREFIXES[manifest.get("acting_network", "online")])
-            contents = [self._read_segment(entry) for entry in manifest["segments"]]
-            require_saved(state, ("replays", "steps"), "the run")
-            if state["steps"] != manifest["step"]:
-                raise CheckpointError(f"state.json is of step {shown(state['steps'])}, expected {manifest['step']}")
-            require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
-            for task, replay in enumerate(replays):
-                replay.require_fits(state["replays"][str(task)])
-            _require_segments(manifest["segments"], contents, replays, state["replays"])
-            # Nothing is changed before everything was read.
-            for task, replay in enumerate(replays):
-                replay.load_state_dict(state["replays"][str(task)])
-            for entry, content in zip(manifest["segments"], contents, strict=True):
-                replay, segment = replays[entry["task"]], Segment(entry["lane"], entry["number"], complete=True)
-                replay.load_segment(segment, _frames(entry, content, replay))  # one by one: they may be gigabytes
+        model = _read_tensors(path, _MODEL_FILE, manifest)
+        training = _read_tensors(path, "training.safetensors", manifest)
+        tree = read_json(_read_file(path, "state.json", manifest), "state.json")
+        state = join(tree, model, training, MODEL_PREFIXES[manifest.get("acting_network", "online")])
+        contents = [self._read_segment(entry) for entry in manifest["segments"]]
+        require_saved(state, ("replays", "steps"), "the run")
+        if state["steps"] != manifest["step"]:
+            raise CheckpointError(f"state.json is of step {shown(state['steps'])}, expected {manifest['step']}")
+        require_saved(state["replays"], map(str, range(len(replays))), "the run's replay memories")
+        for task, replay in enumerate(replays):
+            replay.require_fits(state["replays"][str(task)])
+        _require_segments(manifest["segments"], contents, replays, state["replays"])
+        # Nothing is changed before everything was read.
+        for task, replay in enumerate(replays):
+            replay.load_state_dict(state["replays"][str(task)])
+        for entry, content in zip(manifest["segments"], contents, strict=True):
+            replay, segment = replays[entry["task"]], Segment(entry["lane"], entry["number"], complete=True)
+            replay.load_segment(segment, _frames(entry, content, replay))  # one by one: they may be gigabytes
         complete = {(task, s.lane, s.number) for task, r in enumerate(replays) for s in r.segments() if s.complete}
         keyed = {(entry["task"], entry["lane"], entry["number"]): entry for entry in manifest["segments"]}
         self._stored = {key: entry for key, entry in keyed.items() if key in complete}
@@ -408,13 +407,3 @@ def _frames(entry: dict[str, Any], content: bytes, replay: FrameReplay) -> npt.N
     if replay.frame_dtype.kind == "f" and not np.isfinite(frames).all():
         raise _Unusable(f"{number} has a number that is not finite, expected finite frames; start a new run with --run")
     return frames
-
-
-@contextmanager
-def fitting_state() -> Iterator[None]:
-    """Within it, what code raises about a state that is not one of its own is an error of one line."""
-    try:
-        yield
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        reason = f"{type(error).__name__}: {reason_of(error)}"
-        raise CheckpointError(f"its state is not one that a run saves ({reason:.200})") from error

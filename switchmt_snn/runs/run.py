@@ -25,7 +25,7 @@ from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
-from switchmt_snn.runs.checkpoint import fitting_state, fitting_weights
+from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.environment import describe_environment
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
 from switchmt_snn.runs.history import read_history
@@ -275,7 +275,7 @@ class _Driver:
             self.initial.give(self.training.learner)
             return None, None, [f"begins with the weights of {self.initial.run} after {self.initial.step:,} steps"]
         loaded = self.store.load(self.training.replays)
-        with fitting_weights(), fitting_state():
+        with fitting_weights():
             self.training.load_state_dict(loaded.state)
         notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]
         environment = describe_environment(self.config, self.training.learner.device)

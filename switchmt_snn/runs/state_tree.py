@@ -39,13 +39,12 @@ def join(tree: Any, model: dict[str, torch.Tensor], training: dict[str, torch.Te
     """The state that was split.
 
     Raises:
-        CheckpointError: a tensor is missing.
+        CheckpointError: a tensor is missing, or the tree is too deep.
     """
 
-    def find(path: str) -> torch.Tensor:
-        source = model if path.startswith(prefix) else training
-        key = path.removeprefix(prefix)
-        if key not in source:
+    def find(path: Any) -> torch.Tensor:
+        source = model if isinstance(path, str) and path.startswith(prefix) else training
+        if not isinstance(path, str) or (key := path.removeprefix(prefix)) not in source:
             raise CheckpointError(f"tensor {shown(path)} is missing")
         return source[key]
 
@@ -58,4 +57,7 @@ def join(tree: Any, model: dict[str, torch.Tensor], training: dict[str, torch.Te
             return {key: walk(item) for key, item in value.items()}
         return [walk(item) for item in value] if isinstance(value, list) else value
 
-    return walk(tree)
+    try:
+        return walk(tree)
+    except RecursionError as error:
+        raise CheckpointError("its state has more levels than one that a run saves") from error

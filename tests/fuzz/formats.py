@@ -31,7 +31,7 @@ from switchmt_snn.export.selection import Selection
 from switchmt_snn.learning.events import Stepped
 from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.learning.training import Training
-from switchmt_snn.runs.checkpoint import CheckpointStore, fitting_state, fitting_weights
+from switchmt_snn.runs.checkpoint import CheckpointStore, fitting_weights
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.files import file_name, sha256
 from switchmt_snn.runs.folder import RunFolder
@@ -259,7 +259,7 @@ def _continue(folder: Path, changed: str, content: bytes) -> None:
     training = Training(_gym_run(), suite, torch.device("cpu"))
     try:
         loaded = CheckpointStore(folder).load(training.replays)
-        with fitting_weights(), fitting_state():
+        with fitting_weights():
             training.load_state_dict(loaded.state)
         for event in training.events():
             if isinstance(event, Stepped) and event.step > loaded.step + 12:

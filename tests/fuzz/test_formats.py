@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from switchmt_snn.config import from_dict, load_config
 from switchmt_snn.config.strict_yaml import MOST_BYTES, MOST_LEVELS, parse_yaml, read_text
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.learning.training import Training
+from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.files import file_name
 from tests.fuzz.formats import FORMATS, mutant_of, outcome
 from tests.fuzz.run import campaign
@@ -50,6 +52,18 @@ def test_good_files_are_taken(name: str, tmp_path: Path) -> None:
 def test_every_fault_that_was_found_stays_mended(name: str, file: str, tmp_path: Path) -> None:
     line = outcome(name, tmp_path, (CORPUS / name / file).read_bytes())
     assert line.startswith(EXPECTED[name][file]), line
+
+
+@pytest.mark.slow
+def test_a_fault_of_ours_is_not_taken_for_a_damaged_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise KeyError("a fault of ours")
+
+    for part, name in ((FrameReplay, "require_fits"), (Training, "load_state_dict")):
+        with monkeypatch.context() as patched:
+            patched.setattr(part, name, fails)
+            with pytest.raises(KeyError, match="a fault of ours"):
+                outcome("state", tmp_path, FORMATS["state"].seeds["gym"])
 
 
 def test_every_file_of_the_corpus_has_its_line() -> None:

@@ -62,7 +62,8 @@ class ParameterChange(Criterion):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Put a saved state back; states of runs that began before updates were kept have none, nor use any."""
         require_saved(state, ("history",), type(self).__name__)
-        super().load_state_dict({"updates": [0] * len(state["history"]), **state})
+        count = len(state["history"]) if isinstance(state["history"], list) else 0
+        super().load_state_dict({"updates": [0] * count, **state})
 
 
 def append_snapshot(history: list[Tensor], record: EpisodeRecord) -> None:
