@@ -102,7 +102,7 @@ baseline: both
 @pytest.mark.parametrize("name", sorted(studies()))
 def test_studies_of_the_package_can_be_run(name: str) -> None:
     study = load_study(name, ["total_steps=2000"], [1])
-    assert len(study.variants) == len(study.trials) >= 10
+    assert len(study.variants) == len(study.trials) >= 3
     for trial in study.trials:
         resolve(trial.config)
     assert len(studies()[name]) > 20

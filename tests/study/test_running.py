@@ -270,7 +270,7 @@ def test_a_folder_takes_more_trials_but_no_other_ones(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ([], "study got no CONFIG, expected a YAML file or one of ablation_minatar, policies_minatar, unequal_tasks"),
+        ([], "study got no CONFIG, expected a YAML file or one of ablation_minatar, policies_atari, policies_"),
         (["nothing.yaml"], "no study 'nothing.yaml', expected a YAML file or a study's name"),
         (["policies_minatar", "--status"], "no study in runs/studies/policies_minatar, expected one; begin it with"),
         (["policies_minatar", "--report"], "no study in runs/studies/policies_minatar, expected one; begin it with"),
