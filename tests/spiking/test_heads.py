@@ -122,3 +122,33 @@ def test_unknown_heads_are_refused_by_name() -> None:
     object.__setattr__(config, "heads", "per_game")
     with pytest.raises(ConfigError, match=r"network\.heads is 'per_game', expected shared or per_task"):
         make_head(config, 4, 2, 3)
+
+
+def test_max_membrane_of_a_dueling_network_is_the_largest_of_the_combined_membranes() -> None:
+    """By hand, as docs/algorithm.md defines it; the sum of the streams' own maxima is another number."""
+    network = network_of(heads="shared", readout="max_membrane", readout_beta=0.5).eval()
+    activity: dict[str, torch.Tensor] = {}
+    q_BA = network(torch.rand(8, 4, 10, 10), 0, activity=activity)
+    membranes = {}
+    for name, stream in network.streams.items():
+        membranes[name] = [stream.head(activity[name][0])]
+        for spikes_BN in activity[name][1:]:
+            membranes[name].append(0.5 * membranes[name][-1] + stream.head(spikes_BN))
+    value, advantage = (torch.stack(membranes[name]) for name in ("value", "advantage"))
+    torch.testing.assert_close(q_BA, (value + advantage - advantage.mean(-1, keepdim=True)).amax(0))
+    apart = value.amax(0) + advantage.amax(0) - advantage.amax(0).mean(-1, keepdim=True)
+    assert not torch.allclose(q_BA, apart, atol=1e-4)
+
+
+def test_what_algorithm_md_says_of_adams_steps_holds() -> None:
+    """0.76 % of the initial norm at the first step of 1e-4; 3.16 learning rates where a gradient follows many of 0."""
+    weights = [weight.detach() for weight in network_of(ATARI, heads="shared").parameters() if weight.requires_grad]
+    norm = torch.cat([weight.flatten() for weight in weights]).norm()
+    assert 1e-4 * 3_300_357**0.5 / float(norm) == pytest.approx(0.0076, abs=1e-4)
+    moved = torch.zeros(1, requires_grad=True)
+    adam = torch.optim.Adam([moved], lr=1.0)
+    for gradient in (0.0, 1.0):
+        moved.grad = torch.tensor([gradient])
+        adam.step()
+        adam.state[moved]["step"].fill_(1e6)  # as after many steps
+    assert float(-moved.detach()) == pytest.approx(3.16, abs=0.01)

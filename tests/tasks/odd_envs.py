@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import warnings
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -170,6 +170,35 @@ class Offset(Plain):
     def step(self, action):  # type: ignore[no-untyped-def]
         assert action in (-1, 0, 1)
         return super().step(action)
+
+
+class OffsetShown(Plain):
+    """Actions -1, 0 and 1; the return tells which were played and when, and the observation holds the last one."""
+
+    action_space = Discrete(3, start=-1)
+    render_mode = "rgb_array"
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        self.last = 0
+
+    def reset(self, *, seed=None, options=None):  # type: ignore[no-untyped-def]
+        self.last = 0
+        return super().reset(seed=seed)
+
+    def step(self, action):  # type: ignore[no-untyped-def]
+        self.last = int(action)
+        return super().step(action)
+
+    def reward(self, action: Any) -> Any:
+        return float(action) * (-1.5) ** self.steps
+
+    def observe(self) -> Any:
+        return 3 * np.asarray([np.sin(self.steps), np.cos(3 * self.steps), self.last, -self.last], np.float32)
+
+    def render(self) -> Any:
+        return np.full((32, 32, 3), 80 * (self.last + 1), np.uint8)
 
 
 class ManyActions(Plain):
