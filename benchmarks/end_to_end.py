@@ -9,7 +9,6 @@ turns in one process.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 
 from benchmarks.environments import wrapped_game
-from benchmarks.measure import environment, rates
+from benchmarks.measure import environment, print_rates, rates
 from benchmarks.peers import ACTIONS, PlainLoop
 from benchmarks.update_step import PeerUpdate
 from switchmt_snn.config import load_config, resolve
@@ -138,16 +137,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     keep_freed_memory()  # as `train` does
-    result = measure(options.steps, options.rounds)
-    if options.json:
-        print(json.dumps(result, indent=1))
-        return
-    print(f"{'variant':38}{'steps/s':>9}{'min':>8}{'max':>8}{'x plain':>9}")
-    for name, row in result["variants"].items():
-        print(
-            f"{name:38}{row['median_per_s']:9.1f}{row['min_per_s']:8.1f}{row['max_per_s']:8.1f}"
-            f"{row['faster_than_plain_loop']:9.2f}"
-        )
+    print_rates(measure(options.steps, options.rounds), options.json)
 
 
 if __name__ == "__main__":

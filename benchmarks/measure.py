@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import statistics
 import sys
@@ -104,6 +105,19 @@ def rates(values: list[float]) -> dict[str, Any]:
     """Median and spread of rates per second, and the rates."""
     spread = {"median_per_s": statistics.median(values), "min_per_s": min(values), "max_per_s": max(values)}
     return {**spread, "values_per_s": [round(value, 2) for value in values]}
+
+
+def print_rates(result: dict[str, Any], as_json: bool) -> None:
+    """Rates of variants beside the plain loop, as JSON or as a table."""
+    if as_json:
+        print(json.dumps(result, indent=1))
+        return
+    print(f"{'variant':46}{'steps/s':>9}{'min':>8}{'max':>8}{'x plain':>9}")
+    for name, row in result["variants"].items():
+        print(
+            f"{name:46}{row['median_per_s']:9.1f}{row['min_per_s']:8.1f}{row['max_per_s']:8.1f}"
+            f"{row['faster_than_plain_loop']:9.2f}"
+        )
 
 
 def environment() -> dict[str, Any]:

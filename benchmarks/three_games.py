@@ -9,7 +9,6 @@ A sample is one transition in one gradient step. Variants take turns in one proc
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.end_to_end import BATCH, EPSILON, plain_loop
-from benchmarks.measure import environment, rates
+from benchmarks.measure import environment, print_rates, rates
 from switchmt_snn.config import load_config
 from switchmt_snn.learning.events import Stepped
 from switchmt_snn.learning.training import Training
@@ -97,16 +96,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     keep_freed_memory()  # as `train` does
-    result = measure(options.turns, options.timesteps)
-    if options.json:
-        print(json.dumps(result, indent=1))
-        return
-    print(f"{'variant':46}{'steps/s':>9}{'min':>8}{'max':>8}{'x plain':>9}")
-    for name, row in result["variants"].items():
-        print(
-            f"{name:46}{row['median_per_s']:9.1f}{row['min_per_s']:8.1f}{row['max_per_s']:8.1f}"
-            f"{row['faster_than_plain_loop']:9.2f}"
-        )
+    print_rates(measure(options.turns, options.timesteps), options.json)
 
 
 if __name__ == "__main__":
