@@ -147,7 +147,7 @@ class CheckpointStore:
         self._write_folder(final, files, facts)
         sync_folder(self.folder)
         with writing(self.folder):
-            self._remove_old()
+            self._remove_old(final)
         return final
 
     def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float, judged_by: str) -> None:
@@ -204,8 +204,12 @@ class CheckpointStore:
                     self._stored[key] = entry
             yield entry
 
-    def _remove_old(self) -> None:
-        for path in self.paths()[self.keep :]:
+    def _remove_old(self, saved: Path) -> None:
+        """Drop what is older than the newest ``keep`` up to the saved one.
+
+        Those of a later step are damaged: the run went on from one before them. They count for nothing.
+        """
+        for path in [path for path in self.paths() if path.name <= saved.name][self.keep :]:
             # Without its manifest a half-removed folder is no checkpoint any more.
             (path / "manifest.json").unlink(missing_ok=True)
             shutil.rmtree(path, ignore_errors=True)

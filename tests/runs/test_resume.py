@@ -304,6 +304,28 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(
         store.load(training.replays)
 
 
+def test_a_damaged_newer_checkpoint_does_not_count_as_kept(whole: Path, tmp_path: Path) -> None:
+    """The run went on from the one before it, and was stopped before it came to that step again."""
+    from switchmt_snn.config import resolve
+    from switchmt_snn.config.yaml_io import load_config
+    from switchmt_snn.learning.training import Training
+    from switchmt_snn.runs.checkpoint import CheckpointStore
+    from switchmt_snn.tasks.registry import make_suite
+
+    shutil.copytree(whole / "checkpoints", tmp_path / "checkpoints")
+    settings = resolve(load_config(whole / "config.yaml"))
+    store = CheckpointStore(tmp_path / "checkpoints", keep=1)
+    newest, before, *_ = store.paths()
+    damage(newest / "state.json", "truncated")
+    training = Training(settings, make_suite(settings.tasks), torch.device("cpu"))
+    loaded = store.load(training.replays)
+    training.load_state_dict(loaded.state)
+    saved = store.save(loaded.step + 1, training.state_dict() | {"steps": loaded.step + 1}, training.replays, {})
+    assert store.paths() == [newest, saved]
+    assert before not in store.paths()
+    assert store.load(training.replays).step == loaded.step + 1
+
+
 def test_damage_through_the_command_line(config: Path, whole: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
