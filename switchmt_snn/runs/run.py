@@ -221,7 +221,7 @@ class _Driver:
         if resumed_at is not None:
             self.solved = self._is_solved(self.folder.evaluations.mean_returns(resumed_at, config.evaluation))
         at_its_end = self.solved or training.steps >= config.total_steps
-        if at_its_end and self.folder.evaluations.mean_returns(training.steps, self._final_evaluation()):
+        if at_its_end and self._is_evaluated(training.steps, self._final_evaluation()):
             return RunResult(self.folder.path, "already_finished", training.steps, None, self.solved)
         try:
             return self._run(log_sizes, resumed_at, [*self.notes, *notes])
@@ -317,7 +317,11 @@ class _Driver:
 
     def _owes_evaluation(self, step: int) -> bool:
         """Whether the evaluation of the step at which a run goes on was stopped."""
-        return self._evaluates_at(step) and not self.folder.evaluations.mean_returns(step, self.config.evaluation)
+        return self._evaluates_at(step) and not self._is_evaluated(step, self.config.evaluation)
+
+    def _is_evaluated(self, step: int, settings: EvaluationConfig) -> bool:
+        """Whether every task was; ``evaluate --task`` plays one."""
+        return set(self.training.suite.names) <= self.folder.evaluations.mean_returns(step, settings).keys()
 
     def _evaluate_in_training(self, requested: Callable[[], bool]) -> None:
         """Evaluate. A request to stop ends it; it is played again when the run goes on."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from switchmt_snn import train
+from switchmt_snn import evaluate, train
 from switchmt_snn.cli.entry import main
 from switchmt_snn.config import ExperimentConfig, from_dict
 from switchmt_snn.errors import ConfigError
@@ -85,6 +85,7 @@ def test_a_solved_run_that_was_cut_off_before_its_last_evaluation_makes_it(tmp_p
     first = train(config, tmp_path / "run")
     for path in (tmp_path / "run" / "evaluations").glob("*_seed10001_*"):
         path.unlink()
+    evaluate(tmp_path / "run", config.tasks.names[0], seed=10_001)  # of one task, which is not all of it
     again = train(config, tmp_path / "run")
     assert (again.status, again.step) == ("finished", 100)
     assert first.evaluation is not None
