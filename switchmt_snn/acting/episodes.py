@@ -198,7 +198,7 @@ def _decided(
 
 
 def _announce(policy: str, task: str, lengths_steps: npt.NDArray[np.int64], playing: Playing) -> None:
-    """Say that an episode is long, once for the episodes that are played side by side."""
+    """Say that an episode is long."""
     long = min(LONG_EPISODE_STEPS, playing.max_episode_steps)
     if playing.note is not None and lengths_steps.max() == long:
         rest = f"it is cut off after {playing.max_episode_steps:,} (evaluation.max_episode_steps)"

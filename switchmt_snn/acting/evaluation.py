@@ -165,7 +165,7 @@ def evaluate_agent(
         agent: who plays.
         protocol: how.
         tasks: names; None means all.
-        note: receives what the user should know meanwhile: episodes that do not end.
+        note: receives what the user should know meanwhile, each line once: episodes that do not end.
         stop: asked at every step; the evaluation ends when it says so.
         random_play: episodes of the random policy that are known under this protocol; None plays them.
 
@@ -190,8 +190,15 @@ def evaluate_agent(
         if stop is not None and stop():
             raise EvaluationStopped
 
+    said: set[str] = set()
+
+    def say_once(text: str) -> None:
+        if note is not None and text not in said:
+            said.add(text)
+            note(text)
+
     settings = Playing(
-        protocol.seed, protocol.epsilon, protocol.max_episode_steps, note, go_on, lambda: progress.advance()
+        protocol.seed, protocol.epsilon, protocol.max_episode_steps, say_once, go_on, lambda: progress.advance()
     )
 
     def played(group: tuple[str, int, range]) -> list[EpisodeScore]:

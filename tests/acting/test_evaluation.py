@@ -186,7 +186,7 @@ def test_an_episode_that_does_not_end_is_cut_off_and_announced() -> None:
     result = evaluate_agent(small_agent(suite), replace(PROTOCOL, max_episode_steps=40), note=notes.append)
     assert {(e.length_steps, e.truncated) for e in result.episodes} == {(40, True)}
     assert len(result.episodes) == 14
-    assert len(notes) == 6, "three groups of episodes for each of two policies"
+    assert len(notes) == 2, "one for each policy, not for each of three groups of episodes"
     assert notes[0].endswith(
         "an episode of the agent policy has not ended after 40 steps; it is cut off here "
         "(evaluation.max_episode_steps), with the return that it has"
