@@ -147,6 +147,18 @@ class Evaluation:
         return {"step": self.step, "protocol": asdict(self.protocol), "tasks": [asdict(row) for row in self.tasks]}
 
 
+def once(note: Callable[[str], None] | None) -> Callable[[str], None] | None:
+    """What passes each text on to ``note`` once."""
+    said: set[str] = set()
+
+    def say(text: str) -> None:
+        if note is not None and text not in said:
+            said.add(text)
+            note(text)
+
+    return None if note is None else say
+
+
 def evaluate_agent(
     agent: DecisionMaker,
     protocol: EvaluationProtocol,
@@ -190,15 +202,8 @@ def evaluate_agent(
         if stop is not None and stop():
             raise EvaluationStopped
 
-    said: set[str] = set()
-
-    def say_once(text: str) -> None:
-        if note is not None and text not in said:
-            said.add(text)
-            note(text)
-
     settings = Playing(
-        protocol.seed, protocol.epsilon, protocol.max_episode_steps, say_once, go_on, lambda: progress.advance()
+        protocol.seed, protocol.epsilon, protocol.max_episode_steps, once(note), go_on, lambda: progress.advance()
     )
 
     def played(group: tuple[str, int, range]) -> list[EpisodeScore]:
