@@ -34,7 +34,12 @@ class EvaluationConfig:
         require(self.seed >= 0, "evaluation.seed", self.seed, "at least 0")
         require(self.num_envs >= 1, "evaluation.num_envs", self.num_envs, "at least 1")
         require(self.max_episode_steps >= 1, "evaluation.max_episode_steps", self.max_episode_steps, "at least 1")
-        require(self.every_steps is None or self.every_steps >= 1, "evaluation.every_steps", self.every_steps, ">= 1")
+        require(
+            self.every_steps is None or self.every_steps >= 1,
+            "evaluation.every_steps",
+            self.every_steps,
+            "at least 1 or null",
+        )
         if self.stop_at_returns:
             require(
                 self.every_steps is not None,
@@ -63,7 +68,10 @@ class RecordingConfig:
     def __post_init__(self) -> None:
         check_fields(self, "recording")
         require(
-            self.checkpoint_every_steps >= 1, "recording.checkpoint_every_steps", self.checkpoint_every_steps, ">= 1"
+            self.checkpoint_every_steps >= 1,
+            "recording.checkpoint_every_steps",
+            self.checkpoint_every_steps,
+            "at least 1",
         )
         require(self.keep_checkpoints >= 1, "recording.keep_checkpoints", self.keep_checkpoints, "at least 1")
         require(self.metrics_every_steps >= 1, "recording.metrics_every_steps", self.metrics_every_steps, "at least 1")

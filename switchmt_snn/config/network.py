@@ -106,7 +106,12 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, "network")
-        require(self.hidden_units is None or self.hidden_units >= 1, "network.hidden_units", self.hidden_units, ">= 1")
+        require(
+            self.hidden_units is None or self.hidden_units >= 1,
+            "network.hidden_units",
+            self.hidden_units,
+            "at least 1 or null",
+        )
         require(self.timesteps >= 1, "network.timesteps", self.timesteps, "at least 1")
         for key in ("beta", "alpha", "adaptation_decay"):
             require(0.0 <= getattr(self, key) <= 1.0, f"network.{key}", getattr(self, key), "a decay in [0, 1]")

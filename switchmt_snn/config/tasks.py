@@ -73,7 +73,12 @@ class TasksConfig:
                 f"use a wrapper of your own for others{did_you_mean(name, BUILT_IN_WRAPPERS)}",
             )
         require(self.num_envs >= 1, "tasks.num_envs", self.num_envs, "at least 1")
-        require(self.frame_stack is None or self.frame_stack >= 1, "tasks.frame_stack", self.frame_stack, ">= 1")
+        require(
+            self.frame_stack is None or self.frame_stack >= 1,
+            "tasks.frame_stack",
+            self.frame_stack,
+            "at least 1 or null",
+        )
         require(self.frame_skip >= 1, "tasks.frame_skip", self.frame_skip, "at least 1")
         require(
             self.full_action_space or not self.minimal_action_mask,

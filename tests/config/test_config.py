@@ -81,6 +81,14 @@ def test_broken_yaml_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("key", ["evaluation.every_steps", "network.hidden_units", "tasks.frame_stack"])
+def test_a_refused_0_is_told_how_to_switch_the_setting_off(key: str) -> None:
+    section, name = key.split(".")
+    with pytest.raises(ConfigError, match=f"{key} is 0, expected at least 1 or null"):
+        from_dict({section: {name: 0}})
+    resolve(from_dict({section: {name: None}}))
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_load_resolve_and_round_trip(preset: str, tmp_path: Path) -> None:
     config = load_config(preset)
