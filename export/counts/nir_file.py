@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 
 from switchmt_snn.config import NetworkConfig
-from switchmt_snn.errors import ExportError
+from switchmt_snn.errors import ExportError, shown
 from switchmt_snn.export.counts.network import LayerCounts, TaskCounts, layer_counts
 from switchmt_snn.export.counts.nir_convention import NirConvention, doubts, require_stable, stated
 from switchmt_snn.export.counts.synapses import CountedSynapses, NeuronCounter, SynapseCounter
@@ -38,6 +38,7 @@ _STATES = {nir.IF: 1, nir.LIF: 1, nir.CubaLIF: 2, nir.I: 1, nir.LI: 1}
 """State variables of one neuron by node."""
 _FACTS = ("encoding", "timesteps", "observation_shape", "frame_stack", "scale")
 """Metadata that encoding raw observations needs."""
+_NUMBERS = {"timesteps": int, "frame_stack": int, "scale": float, "event_threshold": float}
 
 Array = npt.NDArray[Any]
 
@@ -76,14 +77,15 @@ def count_nir(path: Path, observations: Path, reset: str | None = None, fires_at
     """
     graph, stored = read_nir(path), _arrays(observations)
     own = all(key in graph.metadata for key in _FACTS)
+    facts = _checked(graph.metadata) if own else {}
     convention = stated(graph, own, _dt(graph, stored), reset, fires_at_threshold)
     require_stable(graph, convention.dt)
     interpreter = NirInterpreter(graph, convention.dt, convention.reset, fires_at_threshold)
     shape = _sides(graph.nodes[interpreter.input].input_type["input"])
     if "inputs" in stored:
-        inputs = _encoded(stored["inputs"], shape, graph.metadata if own else {})
+        inputs = _encoded(stored["inputs"], shape, facts)
     elif own:
-        inputs = _raw(stored["observations"], graph.metadata)
+        inputs = _raw(stored["observations"], facts)
     else:
         raise ExportError(
             f"{path} does not say how to encode observations, expected the metadata {', '.join(_FACTS)} that "
@@ -244,6 +246,30 @@ def _outputs(interpreter: NirInterpreter, name: str) -> tuple[int, ...]:
     return computed
 
 
+def _checked(metadata: dict[str, Any]) -> dict[str, Any]:
+    """The metadata that this package writes, its numbers as such.
+
+    Raises:
+        ExportError: one is no number, or the shape of an observation is no shape.
+    """
+    facts = dict(metadata)
+    for key, kind in _NUMBERS.items():
+        if key in facts:
+            try:
+                facts[key] = kind(np.asarray(facts[key]).item())
+            except (TypeError, ValueError, OverflowError) as error:
+                raise ExportError(
+                    f"the NIR graph's {key} is {shown(facts[key])}, expected one number; export again"
+                ) from error
+    sides = np.asarray(facts["observation_shape"])
+    if sides.ndim != 1 or sides.dtype.kind not in "iu":
+        raise ExportError(
+            f"the NIR graph's observation_shape is {shown(facts['observation_shape'])}, expected whole numbers; "
+            "export again"
+        )
+    return facts
+
+
 def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
     """Raw observations ``[N, *shape]``, encoded as the network was trained; chunk by chunk, seeds 0, 1, 2, ..."""
     expected = _sides(facts["observation_shape"])
@@ -252,12 +278,12 @@ def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
             f"observations has shape {_shape(observations.shape)}, expected {_shape(('N', *expected))} with N >= 1; "
             "record them with the network of this file"
         )
-    if float(facts["scale"]) < 1 and observations.dtype.kind == "f":
+    if facts["scale"] < 1 and observations.dtype.kind == "f":
         raise ExportError(
             f"observations holds {observations.dtype} values, expected raw integers (the graph scales them by "
-            f"{float(facts['scale']):.4g}); store them as they were seen"
+            f"{facts['scale']:.4g}); store them as they were seen"
         )
-    encoding, timesteps, scale = str(facts["encoding"]), int(facts["timesteps"]), float(facts["scale"])
+    encoding, timesteps, scale = str(facts["encoding"]), facts["timesteps"], facts["scale"]
     if encoding not in ENCODINGS:  # a file may not name code to import
         raise ExportError(
             f"the NIR graph's encoding is {encoding!r}, expected one of {', '.join(ENCODINGS)}; store encoded inputs "
@@ -265,10 +291,10 @@ def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
         )
     if encoding == "events" and "event_threshold" not in facts:
         raise ExportError("the NIR graph's metadata has no event_threshold, expected it for events; export again")
-    threshold = float(facts.get("event_threshold", NetworkConfig.event_threshold))
+    threshold = facts.get("event_threshold", NetworkConfig.event_threshold)
     settings = NetworkConfig(encoding=cast(Any, encoding), timesteps=timesteps, event_threshold=threshold)
     # Whether the values suit the encoding was checked when the network was built.
-    encoder = make_encoding(settings, int(facts["frame_stack"]), in_unit_range=True)
+    encoder = make_encoding(settings, facts["frame_stack"], in_unit_range=True)
 
     def batches() -> Iterator[Float]:
         for seed, chunk in enumerate(chunks(observations)):
@@ -281,7 +307,7 @@ def _raw(observations: Array, facts: dict[str, Any]) -> _Inputs:
 
 def _encoded(inputs: Array, shape: tuple[int, ...], facts: dict[str, Any]) -> _Inputs:
     """Inputs ``[T, N, *shape]`` as they are; ``facts`` is empty for a graph of somebody else."""
-    steps = int(facts["timesteps"]) if facts else inputs.shape[0] if inputs.ndim else 0
+    steps = facts["timesteps"] if facts else inputs.shape[0] if inputs.ndim else 0
     if inputs.ndim != 2 + len(shape) or inputs.shape[2:] != shape or 0 in inputs.shape or len(inputs) != steps:
         expected = _shape((steps if facts else "T", "N", *shape))
         raise ExportError(

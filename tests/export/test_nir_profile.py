@@ -242,6 +242,18 @@ def test_a_missing_event_threshold_is_not_guessed(exported, tmp_path: Path) -> N
         counted(path, saved(tmp_path / "x.npz", observations=x))
 
 
+@pytest.mark.slow
+def test_metadata_that_is_no_number_is_refused(exported, tmp_path: Path) -> None:
+    _, x, path = exported("events")
+    good, inputs = nir.read(path), saved(tmp_path / "x.npz", observations=x)
+    for key in ("timesteps", "frame_stack", "scale", "event_threshold", "observation_shape"):
+        changed = nir.read(path)
+        changed.metadata = {**good.metadata, key: np.zeros((0, 2))}
+        write_nir(changed, tmp_path / "changed.nir")
+        with pytest.raises(ExportError, match=f"the NIR graph's {key} is .*, expected .* number"):
+            counted(tmp_path / "changed.nir", inputs)
+
+
 # --- anybody's files
 
 
