@@ -177,7 +177,7 @@ class CheckpointStore:
         manifest = {"format": FORMAT, "program": "switchmt-snn", **facts, "files": sums}
         sealed = {**manifest, "seal": seal(manifest)}
         shutil.rmtree(temporary, ignore_errors=True)
-        with writing(final):
+        with writing(final, whole=True):
             try:
                 temporary.mkdir(parents=True)
                 for name, content in files.items():

@@ -78,14 +78,13 @@ def _finite(value: Any) -> Any:
 
 
 @contextmanager
-def writing(path: Path, option: str | None = None) -> Iterator[None]:
+def writing(path: Path, option: str | None = None, whole: bool = False) -> Iterator[None]:
     """Around code that writes a file or folder: what the system refuses becomes one line that names ``path``.
-
-    Of two of them, one within the other, the outer one names what could not be written.
 
     Args:
         path: what is written, by the name that it has in the end.
         option: by which a user names another place.
+        whole: it is a folder that gets its name when it is whole; errors about files in it name the folder, too.
 
     Raises:
         WriteError: the system refused.
@@ -95,7 +94,7 @@ def writing(path: Path, option: str | None = None) -> Iterator[None]:
     except OSError as error:
         raise WriteError(path, error, option) from error
     except WriteError as error:
-        if not isinstance(error.__cause__, OSError):
+        if not whole or not isinstance(error.__cause__, OSError):
             raise
         raise WriteError(path, error.__cause__, option) from error.__cause__
 

@@ -111,7 +111,7 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
     if out.exists():
         raise RunFolderError(f"{out} exists, expected a new folder; name another with --out")
     step, weights = folder.checkpoints().load_model(checkpoint)
-    with writing(out, "--out"):
+    with writing(out, "--out", whole=True):
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.", suffix=".tmp") as unfinished:
             packed = RunFolder(Path(unfinished) / out.name)
@@ -131,7 +131,7 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
 
 def _whole_copy(source: Path, target: Path) -> None:
     """Copy a folder so that it is whole or absent; of two processes that do it at once, one wins."""
-    with writing(target):
+    with writing(target, whole=True):
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp") as unfinished:
             shutil.copytree(source, Path(unfinished) / target.name, copy_function=shutil.copyfile)

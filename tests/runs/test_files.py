@@ -83,11 +83,11 @@ def test_what_the_system_refuses_names_the_file(number: int, code: int, remedy: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_outer_writer_names_what_cannot_be_written(tmp_path: Path) -> None:
+def test_a_folder_that_is_written_whole_is_named_for_its_files_cannot_be_written(tmp_path: Path) -> None:
     whole = tmp_path / "checkpoint"
-    with pytest.raises(WriteError, match=f"^{whole} cannot be written"), writing(whole):
+    with pytest.raises(WriteError, match=f"^{whole} cannot be written"), writing(whole, whole=True):
         write_atomically(tmp_path / "none" / "a.json", b"")
-    with pytest.raises(WriteError, match=r"a\.json cannot be written"):
+    with pytest.raises(WriteError, match=r"a\.json cannot be written"), writing(whole):
         write_atomically(tmp_path / "none" / "a.json", b"")
 
 
