@@ -34,6 +34,14 @@ def runnable(text: str) -> str:
 
 
 def _found(called: Path) -> str:
+    """The name alone, if the PATH leads to this very file; its folder's links are followed, its own are not.
+
+    A virtual environment's ``python`` is a link to the one that it was made from, which has other packages.
+    """
     on_path = shutil.which(called.name)
-    same = on_path is not None and called.exists() and Path(on_path).samefile(called)
+    same = on_path is not None and _place(Path(on_path)) == _place(called)
     return called.name if same else shlex.quote(str(called))
+
+
+def _place(file: Path) -> Path:
+    return file.parent.resolve() / file.name
