@@ -17,7 +17,7 @@ RESULTS = Path(__file__).parents[2] / "results"
 ATARI_RUN = "three-held-s3"
 WINDOW = 10
 """Episodes of a mean of training returns."""
-BUDGETS_STEPS = (150_000, 300_000, 450_000, 600_000)
+BUDGETS_STEPS = (150_000, 300_000, 450_000, 600_000, 750_000)
 ROWS = ("SwitchMT (paper)", "human (paper)")
 """What counts as 1: the goal of this project, and the paper's human row."""
 

@@ -169,7 +169,8 @@ def products(folder: Path) -> dict[str, Any]:
         name = str(path.relative_to(folder / "run"))
         if (
             path.is_file()
-            and not name.endswith((".tmp", ".lock", ".log", ".zst", ".html", ".svg", ".png"))
+            and not any(part.endswith(".tmp") for part in Path(name).parts)  # what a killed command had not renamed yet
+            and not name.endswith((".lock", ".log", ".zst", ".html", ".svg", ".png"))
             and "environment" not in name
             and name != "attempts.jsonl"  # a study's processes, of which a crash ends one
         ):
