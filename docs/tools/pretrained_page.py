@@ -6,14 +6,15 @@ import json
 from collections.abc import Callable
 from functools import partial
 
+from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.model_card import CARD, model_card
-from switchmt_snn.runs.packing import open_run, pretrained_names
+from switchmt_snn.runs.packing import PRETRAINED, pretrained_names
 
 
 def pretrained_cards() -> dict[str, Callable[[], str]]:
     """``MODEL_CARD.md`` of each trained network: path in the repository -> what makes it."""
     return {
-        f"switchmt_snn/pretrained/{name}/{CARD}": partial(model_card, open_run(f"pretrained/{name}"))
+        f"switchmt_snn/pretrained/{name}/{CARD}": partial(model_card, RunFolder(PRETRAINED / name))
         for name in pretrained_names()
     }
 
@@ -31,7 +32,7 @@ def pretrained_page() -> str:
         "|---|---|---|---:|---:|---:|---|---|",
     ]
     for name in pretrained_names():
-        folder = open_run(f"pretrained/{name}")
+        folder = RunFolder(PRETRAINED / name)
         config = folder.config()
         path = folder.checkpoints().paths()[0]
         manifest = json.loads((path / "manifest.json").read_bytes())
