@@ -51,7 +51,7 @@ def configuration_page() -> str:
         "Presets: `quickstart` (the default of `train`), `paper` (the paper's text), `released` (the authors' script),",
         "`cartpole` (learns in a minute), `classic` (CartPole and Acrobot in one network, some minutes), `minatar`",
         "(three small games that learn on a CPU), `pong` (one Atari game, half the channels), `strong` (three Atari",
-        "games on a CPU in an afternoon; being measured, results/atari), `fast` (for a GPU; not run on one yet).",
+        "games on a CPU in some four hours; one seed so far, results/atari), `fast` (for a GPU; not run on one yet).",
         "`docs/algorithm.md` says where the presets come from.",
     ]
     for prefix, text, rows in field_documentation():
