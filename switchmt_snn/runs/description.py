@@ -28,8 +28,9 @@ class LayerDescription:
     Attributes:
         operations_per_step: dense operations of one simulation step: every weight meets every input it is wired to,
             padding not counted (a spiking layer does at most this many accumulates per step).
-        steps: how often the layer is computed per decision (the first one once under direct encoding, the head once
-            for the mean readout).
+        steps: how often the layer is computed per decision in the deployed network, as ``profile`` counts it: once for
+            the first layer under direct encoding, otherwise T times. (In PyTorch a mean readout's head is computed
+            once, on the mean spikes.)
     """
 
     name: str
@@ -113,7 +114,6 @@ def _layers(network: QNetwork) -> list[LayerDescription]:
     """The network's nodes, each stream's hidden layer and head apart."""
     steps, nodes = network.config.timesteps, network_nodes(network)
     first_steps = 1 if network.encoder.constant_over_time else steps
-    head_steps = 1 if network.config.readout == "mean" else steps
     layers = []
     for layer in nodes.trunk:
         owned = trainable_parameters(network.trunk[layer.name])
@@ -124,7 +124,7 @@ def _layers(network: QNetwork) -> list[LayerDescription]:
         head = trainable_parameters(module.head)
         owned = trainable_parameters(module) - head
         layers.append(_described(stream.hidden.synapses, owned, first_steps, neurons=True))
-        layers.append(_described(stream.head, head, head_steps, neurons=False))
+        layers.append(_described(stream.head, head, steps, neurons=False))
     return layers
 
 

@@ -21,6 +21,7 @@ from switchmt_snn.export import profile, provenance
 from switchmt_snn.export.chips.precision import at_precision, effect_of_precision
 from switchmt_snn.export.counts.network import count_task
 from switchmt_snn.export.folded import fold_agent
+from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.run import load_agent
 from tests.export.export_cases import VARIANTS, RunCommand, make_agent, observations
 
@@ -112,6 +113,14 @@ def test_the_ann_twin_is_the_dense_network_once() -> None:
     macs = 16 * 6 * 9 * 64 + 1024 * 64 + 64 * 6
     assert count_task(spiking, 0, x).dense_macs_of_ann_twin == macs
     assert sum(layer.dense_per_decision for layer in count_task(ann, 0, x).layers) == macs
+
+
+def test_describe_counts_what_the_profile_calls_dense() -> None:
+    """Of networks without dueling: folding makes one head of a dueling network's two."""
+    for method in ("DQN", "DSQN", "MTSpark_AD"):
+        agent = make_agent(method=method)
+        dense = sum(layer.dense_per_decision for layer in count_task(agent, 0, observations(agent, 5)).layers)
+        assert describe_method(agent.config, agent.suite).dense_operations_per_decision == dense
 
 
 def test_wrong_observations_are_refused() -> None:
