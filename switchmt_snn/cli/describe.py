@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -25,7 +26,7 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     flagless = DescribeOptions(experiment=ExperimentConfig())
     source, rest = split_one(DescribeOptions, argv, "describe", flagless)
-    default = for_named_tasks(load_config(source or "quickstart"), rest)
+    default = for_named_tasks(_config_of(source or "quickstart"), rest)
     options = parse(DescribeOptions, rest, "describe", DescribeOptions(experiment=default))
     from switchmt_snn.machine.memory import available_bytes
     from switchmt_snn.runs.description import describe
@@ -45,3 +46,12 @@ def command(argv: list[str]) -> int:
     console.print(methods_table(methods, source))
     console.print(layers_table(methods[config.network.method]))
     return 0
+
+
+def _config_of(source: str) -> ExperimentConfig:
+    """The config of a file, a preset, or a run."""
+    from switchmt_snn.runs.packing import is_pretrained, open_run
+
+    if Path(source).is_dir() or is_pretrained(source):
+        return load_config(open_run(source).path / "config.yaml")
+    return load_config(source)

@@ -20,7 +20,7 @@ from switchmt_snn.machine.program import runnable
 
 ARGUMENTS = {
     "train": ("CONFIG", "a YAML file or a preset (default: with --run the config of the run there, else quickstart)"),
-    "describe": ("CONFIG", "a YAML file or a preset (default: quickstart)"),
+    "describe": ("CONFIG", "a YAML file, a preset, a run folder or pretrained/NAME (default: quickstart)"),
     "evaluate": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "play": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),

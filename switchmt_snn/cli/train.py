@@ -145,10 +145,11 @@ def _write_report(console: Console, path: Path) -> None:
 
 def _starting_config(source: str | None, run: str | None) -> ExperimentConfig:
     """The config that flags change: the file that is named, else the run's own, else quickstart's."""
-    if run is not None:
-        from switchmt_snn.runs.packing import refuse_pretrained
+    for named in (run, source):
+        if named is not None:
+            from switchmt_snn.runs.packing import refuse_pretrained
 
-        refuse_pretrained(run)
+            refuse_pretrained(named)
     if source is None and run is not None:
         from switchmt_snn.runs.folder import RunFolder
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.resources
+import shlex
 import typing
 from collections.abc import Iterable
 from pathlib import Path
@@ -43,6 +44,11 @@ def load_config(
     preset = _preset_text(path)
     if preset is None and not _exists(path):
         raise ConfigError(f"no config file or preset {where!r}{did_you_mean(path.stem, _preset_texts())}")
+    if preset is None and (path / "config.yaml").is_file():
+        raise ConfigError(
+            f"{where} is a run folder, expected a config; its config is {where}/config.yaml; to continue the run: "
+            f"switchmt-snn train --run {shlex.quote(where)}"
+        )
     text = read_text(path, "a config") if preset is None else preset
     data = parse_yaml(text, where, "a config (docs/configuration.md)")
     if data is None:

@@ -64,6 +64,11 @@ def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder
     return copied
 
 
+def is_pretrained(run: str | Path) -> bool:
+    """Whether ``run`` is ``pretrained/NAME``, with any NAME, and no folder of one's own."""
+    return _pretrained_name(Path(run)) is not None
+
+
 def refuse_pretrained(run: str | Path) -> None:
     """Refuse to train in a run that comes with the package, or under its name.
 

@@ -21,7 +21,9 @@ class TaskAsTrained(gymnasium.Env[npt.NDArray[Any], Any]):
     task's own: ``evaluation.max_episode_steps`` is the evaluation's.
 
     An observation is ``[k*c, H, W]`` or ``[k*features]`` (``suite.observation_shape``), as ``Agent.act`` takes it, and
-    an action is a number that ``Agent.act`` gives.
+    an action is a number that ``Agent.act`` gives. Where the task has fewer actions than the network has outputs, the
+    others are refused; ``info["action_mask"]`` of ``reset`` and ``step`` says which it has, as Gymnasium's spaces take
+    it: ``env.action_space.sample(info["action_mask"])``.
     """
 
     def __init__(self, suite: TaskSuite, task: str | int) -> None:
@@ -38,6 +40,7 @@ class TaskAsTrained(gymnasium.Env[npt.NDArray[Any], Any]):
         self._play = Play(suite, self._task, 1)
         first, count = suite.first_action(self._task), suite.num_actions
         self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(count, start=first)
+        self._action_mask = suite.valid_actions_KA[self._task].astype(np.int8)
         dtype: Any = suite.frame_dtype
         is_image = np.dtype(dtype) == np.uint8
         low, high = (0, 255) if is_image else (-np.inf, np.inf)
@@ -47,7 +50,7 @@ class TaskAsTrained(gymnasium.Env[npt.NDArray[Any], Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[Any], dict[str, Any]]:
-        """Start an episode.
+        """Start an episode: its first observation, and an info with the ``action_mask``.
 
         Args:
             seed: of this episode, which is a function of it and of its actions; and, as in Gymnasium, of the seeds of
@@ -57,10 +60,10 @@ class TaskAsTrained(gymnasium.Env[npt.NDArray[Any], Any]):
         super().reset(seed=seed)
         episode = int(self.np_random.integers(2**31)) if seed is None else seed
         self._play.begin(np.zeros(1, np.int64), np.asarray([episode], np.int64))
-        return self._play.observations[0].copy(), {}
+        return self._play.observations[0].copy(), self._info()
 
     def step(self, action: int) -> tuple[npt.NDArray[Any], float, bool, bool, dict[str, Any]]:
-        """One agent step: observation, raw reward, terminated, truncated, and an empty info.
+        """One agent step: observation, raw reward, terminated, truncated, and an info with the ``action_mask``.
 
         Raises:
             TaskError: no such action in this task, or no episode runs.
@@ -74,7 +77,10 @@ class TaskAsTrained(gymnasium.Env[npt.NDArray[Any], Any]):
             raise TaskError(f"no episode of task {name!r} runs, expected reset() before this step")
         result = self._play.step(np.asarray([index], np.int64))
         ended = bool(result.terminated[0]), bool(result.truncated[0])
-        return self._play.observations[0].copy(), float(result.rewards[0]), *ended, {}
+        return self._play.observations[0].copy(), float(result.rewards[0]), *ended, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return {"action_mask": self._action_mask.copy()}
 
     def close(self) -> None:
         """Free the environment."""

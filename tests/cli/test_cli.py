@@ -91,6 +91,24 @@ def test_describe_says_which_config_and_takes_the_one_that_train_takes(capsys) -
 
 
 @pytest.mark.slow
+def test_describe_takes_runs_and_train_says_what_to_do_with_one(capsys, tmp_path: Path) -> None:
+    """A run's config can be described by the run's name; a new run of it needs the file, and going on ``--run``."""
+    code, of_a_run, err = call(capsys, "describe", "pretrained/cartpole", "--json")
+    assert code == 0, err
+    _, of_the_preset, _ = call(capsys, "describe", "cartpole", "--json")
+    assert json.loads(of_a_run)["methods"] == json.loads(of_the_preset)["methods"]
+    (tmp_path / "config.yaml").write_text("seed: 3\n")
+    for words, told in (
+        (["describe", "pretrained/x"], "no pretrained run 'x', expected one of"),
+        (["train", "pretrained/cartpole"], "pretrained/cartpole comes with the package and holds weights only"),
+        (["train", str(tmp_path)], f"is a run folder, expected a config; its config is {tmp_path}/config.yaml; to"),
+    ):
+        code, out, err = call(capsys, *words)
+        assert (code, out) == (2, "")
+        assert told in err
+
+
+@pytest.mark.slow
 def test_describe_names_trained_and_deployed_parameters(capsys) -> None:
     """32 quantiles add 31 times the heads in training; what decides has the paper's count."""
     flags = ["describe", "--network.quantiles", "32", "--learning.loss", "huber"]

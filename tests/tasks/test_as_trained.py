@@ -89,6 +89,10 @@ def test_wrong_use_is_one_line() -> None:
     env.reset(seed=0)
     with pytest.raises(TaskError, match=r"the action is 2, expected one of task 'CartPole-v1': \[0, 1\]"):
         env.step(2)
+    mask = env.reset(seed=0)[1]["action_mask"]
+    assert {int(env.action_space.sample(mask)) for _ in range(40)} == {0, 1}
+    assert env.step(1)[4]["action_mask"].tolist() == [1, 1, 0]
+    env.reset(seed=0)
     while not any(env.step(1)[2:4]):
         pass
     with pytest.raises(TaskError, match="expected reset"):
