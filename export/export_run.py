@@ -268,7 +268,7 @@ def evaluate_exported(
     compared = ComparedAgent(played, agent)
     settings = replace(config.evaluation, **protocol)
     tasks = None if task is None else (suite.names[suite.index(task)],)
-    conditions = EvaluationProtocol.of(settings, config.tasks)
+    conditions = EvaluationProtocol.of(settings, config.tasks, agent.step)
     folder = open_run(folder.path, to_write=True)
     known = RandomPlay(folder.path, config, suite, conditions)
     evaluation = evaluate_agent(compared, conditions, tasks, random_play=known)

@@ -15,6 +15,7 @@ from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.config.numbers import exact
 from switchmt_snn.machine.cores import parts
 from switchmt_snn.machine.progress import progress_of
+from switchmt_snn.tasks.changing import changed_conditions
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -67,7 +68,8 @@ class EvaluationProtocol:
         num_envs: episodes that are played side by side.
         suite: value of ``tasks.suite``.
         max_episode_steps: an episode that has not ended after so many steps is cut off, with the return that it has.
-        environment: the suite's conditions of play in words, as ``sticky actions 0.25``.
+        environment: the suite's conditions of play in words, as ``sticky actions 0.25``, and what tasks have become
+            (``tasks.later_names``).
         score: what is summed.
     """
 
@@ -81,8 +83,8 @@ class EvaluationProtocol:
     max_episode_steps: int = EvaluationConfig.max_episode_steps
 
     @classmethod
-    def of(cls, evaluation: EvaluationConfig, tasks: TasksConfig) -> EvaluationProtocol:
-        """The protocol that a config describes."""
+    def of(cls, evaluation: EvaluationConfig, tasks: TasksConfig, step: int = 0) -> EvaluationProtocol:
+        """The protocol that a config describes, for weights of ``step``."""
         return cls(
             episodes=evaluation.episodes,
             epsilon=evaluation.epsilon,
@@ -90,7 +92,7 @@ class EvaluationProtocol:
             num_envs=min(evaluation.num_envs, evaluation.episodes),
             suite=tasks.suite,
             max_episode_steps=evaluation.max_episode_steps,
-            environment=suite_of(tasks).protocol,
+            environment=(*suite_of(tasks).protocol, *changed_conditions(tasks, step)),
         )
 
     @classmethod

@@ -62,7 +62,7 @@ def command(argv: list[str]) -> int:
     config = agent.agent.config
     evaluation = replace(config.evaluation, episodes=options.episodes or 1, num_envs=1, **changes)
     names = tuple(agent.suite.names[agent.suite.index(name)] for name in options.task) or agent.suite.names[:1]
-    protocol = EvaluationProtocol.of(evaluation, config.tasks)
+    protocol = EvaluationProtocol.of(evaluation, config.tasks, agent.step)
     path = open_run(path, to_write=True).path
     out = options.out
     if out is None and not options.live:

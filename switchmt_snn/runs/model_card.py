@@ -84,7 +84,7 @@ def _training(config: ExperimentConfig, step: int, history: History, environment
     shares = history.measured[-1].steps_by_task if history.measured else ()
     played = ", ".join(f"{name} {count:,}" for name, count in zip(config.tasks.names, shares, strict=False))
     versions = environment.get("versions", {})
-    conditions = EvaluationProtocol.of(config.evaluation, config.tasks).environment
+    conditions = EvaluationProtocol.of(config.evaluation, config.tasks, step).environment
     return [
         "## What it was trained on, and how long",
         "",

@@ -357,7 +357,7 @@ class _Driver:
         learner = training.learner
         suite = training.suite.at(training.steps)
         agent = Agent(learner.acting_network, suite, self.config, learner.device, training.steps)
-        protocol = EvaluationProtocol.of(settings, self.config.tasks)
+        protocol = EvaluationProtocol.of(settings, self.config.tasks, agent.step)
         self._note(f"evaluating: {protocol}")
         known = RandomPlay(self.folder.path, self.config, suite, protocol)
         evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop, random_play=known)
@@ -434,7 +434,7 @@ def evaluate(
     agent = load_agent(folder.path, checkpoint)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
-    conditions = EvaluationProtocol.of(settings, agent.config.tasks)
+    conditions = EvaluationProtocol.of(settings, agent.config.tasks, agent.step)
     folder = open_run(folder.path, to_write=save)
     known = RandomPlay(folder.path, agent.config, agent.suite, conditions) if save else None
     evaluation = evaluate_agent(agent, conditions, tasks, note, random_play=known)

@@ -51,3 +51,11 @@ def changing(both: TaskSuite, config: TasksConfig) -> TaskSuite:
     changed = tuple(task for task, place in enumerate(places) if place != task)
     assert config.later_from_steps is not None
     return replace(earlier, later=Later(config.later_from_steps, later, changed))
+
+
+def changed_conditions(config: TasksConfig, step: int) -> tuple[str, ...]:
+    """Conditions of play after ``step`` agent steps of a run, in words: each task that is another one by then."""
+    if config.later_from_steps is None or step < config.later_from_steps:
+        return ()
+    pairs = zip(config.names, config.later_names, strict=True)
+    return tuple(f"{name} played as {later}" for name, later in pairs if name != later)

@@ -134,6 +134,8 @@ def test_what_is_evaluated_is_the_task_as_it_is_at_the_weights_step(tmp_path: Pa
     agent.suite = replace(make_suite(swapped), names=agent.suite.names)
     other = evaluate_agent(agent, EvaluationProtocol.of(replace(small().evaluation, episodes=2), small().tasks))
     assert [row.mean for row in own.tasks] == [row.mean for row in other.tasks]
+    assert str(own.protocol).endswith(f", CartPole-v1 played as {SWAPPED}")
+    assert EvaluationProtocol.of(small().evaluation, TASKS, CHANGE - 1).environment == ()
     with (run / "episodes.csv").open() as file:
         assert {row["task"] for row in csv.DictReader(file)} <= {"CartPole-v1", "Acrobot-v1"}
 
