@@ -33,6 +33,10 @@ class ConfigError(SwitchMTError):
     """A setting is unknown, of the wrong type, out of range, or contradicts another one."""
 
 
+class UntrustedError(SwitchMTError):
+    """A stored file names modules that this user neither trained with nor trusts (``--trust``, ``trust=True``)."""
+
+
 class TaskError(SwitchMTError):
     """A task does not exist, cannot be made, or has a space that a Q-network cannot serve."""
 

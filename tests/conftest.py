@@ -10,10 +10,17 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from switchmt_snn.config import ExperimentConfig, resolve
+from switchmt_snn.config import ExperimentConfig, resolve, trust
 from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.runs.plan import decide
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite, VectorStep
+
+
+@pytest.fixture(autouse=True)
+def _own_trust(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A key of the tests' own, and no module that an earlier test had refused or trusted."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / "state"))
+    monkeypatch.setattr(trust, "known", trust.Known())
 
 
 @pytest.fixture(autouse=True)

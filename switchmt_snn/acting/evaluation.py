@@ -13,6 +13,8 @@ import numpy.typing as npt
 from switchmt_snn.acting.episodes import EpisodeScore, Playing, play_episodes
 from switchmt_snn.config import EvaluationConfig, TasksConfig
 from switchmt_snn.config.numbers import exact
+from switchmt_snn.config.plugins import is_plugin
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.machine.cores import parts
 from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.tasks.changing import changed_conditions
@@ -102,6 +104,8 @@ class EvaluationProtocol:
         if "environment" in stored:
             return cls(**{**own, "environment": tuple(stored["environment"])})
         settings = {field.name: stored[field.name] for field in fields(TasksConfig) if field.name in stored}
+        if is_plugin(settings.get("suite")):
+            raise ConfigError("the protocol has no environment, expected one: its suite is from outside the package")
         return cls(**own, environment=suite_of(TasksConfig(**settings)).protocol)
 
     def __str__(self) -> str:

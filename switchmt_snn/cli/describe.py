@@ -18,6 +18,8 @@ class DescribeOptions:
     """Describe what a config would build; every setting of the config is an option."""
 
     experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
+    trust: bool = False
+    """Import modules that the config of a run folder names, although you did not make it: this runs their code."""
     json: bool = False
     """Print everything as JSON."""
 

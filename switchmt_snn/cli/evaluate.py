@@ -31,6 +31,8 @@ class EvaluateOptions:
     runtime: Literal["torch", "onnx", "nir"] = "torch"
     """What plays. torch: the trained network. onnx: the run's ONNX file in onnxruntime. nir: its NIR files in the NIR
     interpreter."""
+    trust: bool = False
+    """Import modules that the run names, although you did not make it: this runs their code."""
     json: bool = False
     """Print the scores as JSON."""
 

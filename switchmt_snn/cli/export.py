@@ -35,6 +35,8 @@ class ExportOptions:
     """Which weights."""
     out: Path | None = None
     """Folder to write to. Default: the run's export/."""
+    trust: bool = False
+    """Import modules that the run names, although you did not make it: this runs their code."""
     json: bool = False
     """Print files and parity as JSON."""
 

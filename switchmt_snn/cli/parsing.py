@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import os
+import re
 import shlex
 from dataclasses import replace
 from typing import Any
@@ -15,6 +17,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from switchmt_snn.config import ExperimentConfig, load_config, presets
 from switchmt_snn.config.numbers import whole_number
 from switchmt_snn.config.other_names import meant
+from switchmt_snn.config.trust import allow, allow_everything, modules_in
 from switchmt_snn.errors import ConfigError, printable
 from switchmt_snn.machine.program import runnable
 
@@ -268,7 +271,7 @@ def parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(
+            options = tyro.cli(
                 kind,
                 default=default,
                 args=argv,
@@ -283,6 +286,19 @@ def parse(kind: Any, argv: list[str], command: str, default: Any) -> Any:
         text = unknown or _one_line(complaint.getvalue())
         hint = _on_or_off(kind, argv, default)
         raise ConfigError(f"{text}{hint}; see switchmt-snn {command} --help") from None
+    if getattr(options, "trust", False):
+        allow_everything()
+    allow(_modules_named(argv))
+    return options
+
+
+def _modules_named(argv: list[str]) -> tuple[str, ...]:
+    """Modules that values of flags name, as in ``--task my_module:MyEnv-v0`` and ``--set tasks.names=[a:B-v0]``.
+
+    The name of a file or folder says nothing of a user's trust: somebody else may have chosen it.
+    """
+    values = [word for word in argv if not word.startswith("--")] + [word.partition("=")[2] for word in argv]
+    return modules_in([re.split(r"[\s=,\[\]'\"]+", value) for value in values if not os.path.exists(value)])
 
 
 def _renamed(word: str, renamed: dict[str, str]) -> str:

@@ -39,6 +39,8 @@ class PlayOptions:
     """Frames (decisions) per second. Default: real time for Atari, else 15."""
     live: bool = False
     """Show the film in a window while it is made."""
+    trust: bool = False
+    """Import modules that the run names, although you did not make it: this runs their code."""
     json: bool = False
     """Print the film's facts as JSON."""
 

@@ -32,6 +32,8 @@ class ProfileOptions:
     """For a NIR file of another tool: a membrane exactly at its threshold fires (SpikingJelly, sinabs)."""
     out: Path | None = None
     """Folder to write to. Default: RUN/profile/; with several runs, the comparison goes into the first one's."""
+    trust: bool = False
+    """Import modules that the runs name, although you did not make them: this runs their code."""
     json: bool = False
     """Print the profile as JSON."""
 

@@ -24,6 +24,8 @@ class ReplayOptions:
     """Thresholds in place of the run's, each as KEY=VALUE: switching.plateau_t=0.5."""
     out: Path | None = None
     """Also write a CSV file with a row for each policy and visit."""
+    trust: bool = False
+    """Import modules that the run names, although you did not make it: this runs their code."""
     json: bool = False
     """Print summaries and rows as JSON."""
 

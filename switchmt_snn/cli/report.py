@@ -17,6 +17,8 @@ class ReportOptions:
     """Folder to write to. Default: the run's own; with several runs the first one's."""
     figures: bool = False
     """Also write every figure as SVG, PNG and CSV, to the folder figures (or comparison_figures)."""
+    trust: bool = False
+    """Import modules that the runs name, although you did not make them: this runs their code."""
     json: bool = False
     """Print the page's numbers as JSON."""
 

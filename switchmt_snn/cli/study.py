@@ -45,6 +45,8 @@ class StudyOptions:
     """Show how far the trials are, and stop."""
     report: bool = False
     """Write the report of the trials that have finished by now, and stop."""
+    trust: bool = False
+    """Import modules that the study's folder names, although you did not make it: this runs their code."""
     json: bool = False
     """Print the result as JSON (progress goes to stderr)."""
 
@@ -101,9 +103,11 @@ def _status(console: Console, study: Study, folder: StudyFolder, as_json: bool) 
 
 def _dry_run(console: Console, study: Study, folder: StudyFolder, options: StudyOptions) -> int:
     from switchmt_snn.study.estimate import cost_facts, cost_table
+    from switchmt_snn.study.folder import require_trusted_trials
     from switchmt_snn.study.local import jobs_for
     from switchmt_snn.study.probe import probe
 
+    require_trusted_trials(study.trials)
     jobs = jobs_for(study.trials, options.jobs)
     trials = study.trials
     if folder.is_study:
@@ -137,8 +141,10 @@ def _report(console: Console, study: Study, folder: StudyFolder, as_json: bool) 
 def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOptions) -> int:
     from switchmt_snn.runs.signals import stop_requests
     from switchmt_snn.study.engine import run_trials
+    from switchmt_snn.study.folder import require_trusted_trials
     from switchmt_snn.study.watching import Screen
 
+    require_trusted_trials(study.trials)
     engine = _engine(options)
     jobs = engine.jobs(study.trials, options.jobs)
     lock = folder.lock()

@@ -31,6 +31,9 @@ class TrainOptions:
     """Run folder: continued if it holds a run of the same config, else made of CONFIG. Default: a new one in runs/."""
     print_config: bool = False
     """Print the resolved config as YAML and stop."""
+    trust: bool = False
+    """Import modules that the runs of --run and --initial-weights name, although you did not make
+    them: this runs their code."""
     json: bool = False
     """Print the result as JSON (progress goes to stderr)."""
 

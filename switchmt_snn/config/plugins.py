@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any, NewType
 
 from switchmt_snn.config.strict_yaml import parse_yaml
+from switchmt_snn.config.trust import require_trusted
 from switchmt_snn.errors import ConfigError, SwitchMTError
 
 PluginName = NewType("PluginName", str)
@@ -58,11 +59,13 @@ def import_plugin_module(module_name: str) -> ModuleType:
     """Import a module from outside the package.
 
     The script that runs is not imported a second time. The current folder is searched last, so that ``switchmt-snn``
-    finds modules that lie in it.
+    finds modules that lie in it. All imports of modules that a config names pass here.
 
     Raises:
+        UntrustedError: a stored file names it, and this user does not trust it (``switchmt_snn.config.trust``).
         ImportError: the module, or one that it imports, is not found, or its code fails.
     """
+    require_trusted([module_name])
     if module_name == _script_name():
         return _script()
     if module_name.endswith(".__main__"):

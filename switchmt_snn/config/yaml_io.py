@@ -17,11 +17,15 @@ from switchmt_snn.config.decided import KEY, closed, opened, presumably_open, re
 from switchmt_snn.config.experiment import ExperimentConfig
 from switchmt_snn.config.other_names import OTHER_NAMES, meant
 from switchmt_snn.config.strict_yaml import parse_yaml, read_text
+from switchmt_snn.config.trust import allow, modules_in, note_stored, stored_signature
 from switchmt_snn.errors import ConfigError, did_you_mean, nearest, printable
 
 
 def load_config(
-    source: str | Path, absent: dict[str, dict[str, Any]] | None = None, reopen: bool = True
+    source: str | Path,
+    absent: dict[str, dict[str, Any]] | None = None,
+    reopen: bool = True,
+    stored: bool = False,
 ) -> ExperimentConfig:
     """Read a config from a YAML file, or a preset by name (``quickstart``, ``paper``, ``configs/paper.yaml``).
 
@@ -30,6 +34,8 @@ def load_config(
         absent: what settings by section are, if the file does not name them; None means the defaults.
         reopen: a file that a run or ``--print-config`` wrote says which values were decided from ``auto`` or null. True
             leaves them open again, so that a variation decides them anew; False takes them as they were decided.
+        stored: the user names a folder that holds the file, not the file. Modules that it names are then trusted only
+            if the user made the folder (``switchmt_snn.config.trust``); so it is with the config of any run folder.
 
     Raises:
         ConfigError: no such file or preset, not YAML, or a key or value that the config does not take.
@@ -60,7 +66,14 @@ def load_config(
         if isinstance(settings.get(section, {}), dict):
             settings[section] = values | settings.get(section, {})
     config = from_dict(settings, where=where)
-    is_older_run = path.name == "config.yaml" and path.with_name("environment.json").is_file() and KEY not in data
+    beside = path.with_name("environment.json")
+    is_of_run = preset is None and path.name == "config.yaml" and beside.is_file()
+    if modules := modules_in(to_dict(config)):
+        if is_of_run or stored:
+            note_stored(modules, path.parent, stored_signature(beside))
+        else:
+            allow(modules)
+    is_older_run = is_of_run and KEY not in data
     return presumably_open(config) if reopen and is_older_run else config
 
 

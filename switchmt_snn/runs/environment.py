@@ -14,8 +14,10 @@ from typing import Any
 
 import torch
 
-from switchmt_snn.config import ExperimentConfig
+from switchmt_snn.config import ExperimentConfig, to_dict
 from switchmt_snn.config.plugins import is_plugin, plugin_file
+from switchmt_snn.config.trust import SIGNATURE, modules_in, signature_of
+from switchmt_snn.errors import reason_of
 from switchmt_snn.machine.program import NAME, is_module
 from switchmt_snn.tasks.registry import SUITES, suite_of
 
@@ -57,6 +59,18 @@ def files_sha256(config: ExperimentConfig) -> dict[str, str]:
         if path is not None and path.is_file():
             files[plugin.partition(":")[0]] = path
     return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+
+
+def signature_facts(config: ExperimentConfig) -> tuple[dict[str, str], tuple[str, ...]]:
+    """What a new run stores so that its modules are known as this user's, and a note if there can be nothing."""
+    modules = modules_in(to_dict(config))
+    if not modules:
+        return {}, ()
+    try:
+        return {SIGNATURE: signature_of(modules)}, ()
+    except OSError as error:
+        note = f"this run names modules ({', '.join(modules)}), but no key of yours can be kept ({reason_of(error)})"
+        return {}, (f"{note}: later commands on it need --trust",)
 
 
 def command_line() -> str:

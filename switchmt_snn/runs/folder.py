@@ -17,8 +17,9 @@ from typing import Any
 import filelock
 
 from switchmt_snn.acting.evaluation import Evaluation
-from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
+from switchmt_snn.config import ExperimentConfig, differences, load_config, to_dict, to_yaml
 from switchmt_snn.config.bounds import LARGEST
+from switchmt_snn.config.trust import allow, modules_in
 from switchmt_snn.errors import ConfigError, RunFolderError, WriteError, nearest
 from switchmt_snn.runs.checkpoint import CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
@@ -173,12 +174,19 @@ class RunFolder:
         threads = read_environment(self.path).get("torch_threads")
         return threads if type(threads) is int and 1 <= threads <= LARGEST["threads"] else None
 
-    def config(self) -> ExperimentConfig:
-        """The run's resolved config."""
+    def config(self, trust: bool = False) -> ExperimentConfig:
+        """The run's resolved config.
+
+        Args:
+            trust: let modules that it names be imported, whoever made the run (``switchmt_snn.config.trust``).
+        """
         path = self.path / "config.yaml"
         if not path.is_file():
             raise RunFolderError(f"{path} is missing, expected the run's config; the run folder is damaged")
-        return load_config(path, BEFORE, reopen=False)
+        config = load_config(path, BEFORE, reopen=False, stored=True)
+        if trust:
+            allow(modules_in(to_dict(config)))
+        return config
 
     def checkpoints(self, keep: int = 2) -> CheckpointStore:
         """The run's checkpoints."""
@@ -216,7 +224,7 @@ class RunFolder:
     def save_config(self, config: ExperimentConfig) -> None:
         """Replace the stored config (a raised step budget)."""
         path = self.path / "config.yaml"
-        asked = replace(load_config(path), total_steps=config.total_steps)
+        asked = replace(load_config(path, stored=True), total_steps=config.total_steps)
         write_atomically(path, to_yaml(config, asked).encode())
 
     def lock(self) -> filelock.BaseFileLock:

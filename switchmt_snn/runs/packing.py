@@ -7,9 +7,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from switchmt_snn.config.trust import SIGNATURE
 from switchmt_snn.errors import RunFolderError, nearest
-from switchmt_snn.runs.files import write_atomically, writing
-from switchmt_snn.runs.folder import RunFolder, latest_run
+from switchmt_snn.runs.files import json_text, write_atomically, writing
+from switchmt_snn.runs.folder import RunFolder, latest_run, read_environment
 from switchmt_snn.runs.model_card import CARD, model_card
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
@@ -32,7 +33,7 @@ def pretrained_names() -> list[str]:
     return sorted(path.parent.name for path in PRETRAINED.glob("*/environment.json"))
 
 
-def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder:
+def open_run(run: str | Path | None = None, to_write: bool = False, trust: bool = False) -> RunFolder:
     """The run that a user names: a folder, ``pretrained/NAME`` of the package, or None for the newest under ``runs/``.
 
     Args:
@@ -40,10 +41,18 @@ def open_run(run: str | Path | None = None, to_write: bool = False) -> RunFolder
         to_write: files will be added to the run. A pretrained run is then copied to ``runs/pretrained/NAME`` the first
             time, and opened there from then on: the package's own files stay as they are. Open a run without it until
             nothing can be refused any more, then ``open_run(folder.path, to_write=True)``.
+        trust: let modules that the run names be imported, whoever made it (SECURITY.md).
 
     Raises:
         RunFolderError: no such run, or it cannot be copied.
     """
+    folder = _opened(run, to_write)
+    if trust:
+        folder.config(trust)
+    return folder
+
+
+def _opened(run: str | Path | None, to_write: bool) -> RunFolder:
     if run is None:
         return RunFolder(latest_run()).require()
     path = Path(run)
@@ -97,8 +106,9 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
 
     A model card (``MODEL_CARD.md``) says what it is; its energy comes from the run's profile.
 
-    The copy is a run folder for every command that reads one. Training cannot be continued from it: that needs the
-    replay, the optimizer's moments and the environments' states.
+    The copy is a run folder for every command that reads one. Modules that it names need ``--trust``, of its maker
+    too: the proof of who made the run (``switchmt_snn.config.trust``) is not given away. Training cannot be continued
+    from it: that needs the replay, the optimizer's moments and the environments' states.
 
     Args:
         run: as for ``open_run``.
@@ -124,7 +134,7 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
             for name in _FILES:
                 if (folder.path / name).is_file():
                     (packed.path / name).parent.mkdir(exist_ok=True)
-                    write_atomically(packed.path / name, (folder.path / name).read_bytes())
+                    write_atomically(packed.path / name, _given_away(folder.path / name))
             for path in sorted(folder.evaluations.folder.glob(f"step-{step:012d}_*")):
                 (packed.path / "evaluations").mkdir(exist_ok=True)
                 write_atomically(packed.path / "evaluations" / path.name, path.read_bytes())
@@ -132,6 +142,15 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
             write_atomically(packed.path / CARD, model_card(packed).encode())
             packed.path.rename(out)
     return out
+
+
+def _given_away(path: Path) -> bytes:
+    """A file's content without this user's signature."""
+    content = path.read_bytes()
+    if path.name != "environment.json" or SIGNATURE not in (facts := read_environment(path.parent)):
+        return content
+    del facts[SIGNATURE]
+    return json_text(facts, indent=1).encode()
 
 
 def _whole_copy(source: Path, target: Path) -> None:

@@ -19,17 +19,18 @@ from typing import Any, Literal
 import torch
 
 from switchmt_snn.config import ExperimentConfig, resolve
-from switchmt_snn.config.plugins import is_plugin
+from switchmt_snn.config.plugins import is_plugin, plugin_name
+from switchmt_snn.config.trust import allow, modules_in
 from switchmt_snn.errors import ConfigError
-from switchmt_snn.learning.switching import SwitchingPolicy, check_policy
+from switchmt_snn.learning.switching import Criterion, SwitchingPolicy, check_policy, with_policy
 from switchmt_snn.machine.devices import has_bfloat16, select_device
 from switchmt_snn.replay.size import compresses_replay
 from switchmt_snn.runs.description import describe_method
 from switchmt_snn.runs.memory import MemoryEstimate, require_gpu_memory, require_memory
 from switchmt_snn.spiking.encoding_check import try_encoding
 from switchmt_snn.tasks.check import check_before_training, warnings_unless_refused
-from switchmt_snn.tasks.registry import make_suite, suite_of
-from switchmt_snn.tasks.suite import TaskSuite
+from switchmt_snn.tasks.registry import make_suite, register_suite, suite_of
+from switchmt_snn.tasks.suite import Suite, TaskSuite
 from switchmt_snn.updates.engine import ENGINES
 
 
@@ -50,6 +51,19 @@ class Plan:
     device: torch.device
     memory: MemoryEstimate
     notes: tuple[str, ...]
+
+
+def with_classes(
+    config: ExperimentConfig, policy: type[Criterion] | None, suite: type[Suite] | None
+) -> ExperimentConfig:
+    """The config with classes of the caller's in place of its own; their modules are trusted."""
+    if policy is not None:
+        config = replace(config, switching=with_policy(config.switching, policy))
+        allow(modules_in(config.switching.policy))
+    if suite is not None:
+        config = replace(config, tasks=replace(config.tasks, suite=plugin_name(register_suite(suite), "suite")))
+        allow(modules_in(config.tasks.suite))
+    return config
 
 
 def plan(

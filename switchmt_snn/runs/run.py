@@ -14,29 +14,28 @@ import torch
 from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, EvaluationStopped, evaluate_agent
 from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, load_config, to_dict
-from switchmt_snn.config.plugins import plugin_name
 from switchmt_snn.errors import CheckpointError, TrainingFailed, WriteError
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.learning.parts import make_learner, observation_spec
 from switchmt_snn.learning.shared_learner import SharedLearner
-from switchmt_snn.learning.switching import Criterion, with_policy
+from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training
 from switchmt_snn.machine.devices import keep_freed_memory, select_device
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_weights
-from switchmt_snn.runs.environment import describe_environment
+from switchmt_snn.runs.environment import describe_environment, signature_facts
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
 from switchmt_snn.runs.history import read_history
 from switchmt_snn.runs.initial_weights import InitialWeights, read_initial_weights
 from switchmt_snn.runs.logs import RunLogs
 from switchmt_snn.runs.packing import open_run, refuse_pretrained
-from switchmt_snn.runs.plan import decide, plan
+from switchmt_snn.runs.plan import decide, plan, with_classes
 from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.signals import stop_requests
 from switchmt_snn.spiking.network import build_network
-from switchmt_snn.tasks.registry import make_suite, register_suite
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import Suite
 from switchmt_snn.updates.processes import ProcessGroup, join_processes
 
@@ -81,6 +80,7 @@ def train(
     observers: Sequence[Observer] = (),
     policy: type[Criterion] | None = None,
     suite: type[Suite] | None = None,
+    trust: bool = False,
 ) -> RunResult:
     """Train, or continue a run.
 
@@ -92,6 +92,7 @@ def train(
         policy: a switching criterion of your own; it replaces ``switching.policy`` and takes ``switching.options``.
             The run stores its name, so that it can be continued (docs/extending.md, Switching policy).
         suite: a task suite of your own; it replaces ``tasks.suite``, likewise (docs/extending.md, Task and suite).
+        trust: let modules that ``run`` names be imported although this user did not make it (SECURITY.md).
 
     Under ``torchrun`` the first process does all this, and every update is divided among all processes.
 
@@ -111,7 +112,7 @@ def train(
     try:
         if group is not None and group.rank > 0:
             return _serve(group)
-        return _train(config, run, observers, group, policy, suite)
+        return _train(config, run, observers, group, policy, suite, trust)
     finally:
         if group is not None:
             group.leave()
@@ -124,16 +125,14 @@ def _train(
     group: ProcessGroup | None,
     policy: type[Criterion] | None,
     suite: type[Suite] | None,
+    trust: bool,
 ) -> RunResult:
     if run is not None:
         refuse_pretrained(run)
     folder = RunFolder(Path(run)) if run is not None else None
-    stored = folder.config() if folder is not None and folder.is_run else None
+    stored = folder.config(trust) if folder is not None and folder.is_run else None
     config = _asked(config, folder, stored)
-    if policy is not None:
-        config = replace(config, switching=with_policy(config.switching, policy))
-    if suite is not None:
-        config = replace(config, tasks=replace(config.tasks, suite=plugin_name(register_suite(suite), "suite")))
+    config = with_classes(config, policy, suite)
     planned = plan(config, stored) if group is None else plan(config, stored, group.size, group.device(config.device))
     if folder is not None and stored is not None:
         check_same_config(decide(stored, stored, planned.suite, planned.device)[0], planned.config, folder.path)
@@ -149,11 +148,12 @@ def _train(
     initial = None if has_checkpoint else read_initial_weights(planned.config, planned.suite, begun)
     if folder is None:
         folder = claim_new_run(config.name)
+    signature, unsigned = signature_facts(planned.config) if stored is None else ({}, ())
     lock = folder.lock()
     try:
         folder.require_unchanged(stored is not None)
         if stored is None:
-            environment = describe_environment(planned.config, planned.device)
+            environment = describe_environment(planned.config, planned.device) | signature
             if initial is not None:
                 environment["initial_weights"] = initial.facts()
             folder.create(planned.config, environment, config)
@@ -163,7 +163,7 @@ def _train(
             group.share(to_dict(planned.config))
         training = Training(planned.config, planned.suite, planned.device, group)
         try:
-            return _Driver(folder, training, observers, planned.notes, initial).run()
+            return _Driver(folder, training, observers, (*planned.notes, *unsigned), initial).run()
         finally:
             training.close()
     finally:
@@ -371,7 +371,11 @@ class _Driver:
 
 
 def load_agent(
-    run: str | Path | None = None, checkpoint: str = "last", device: str = "auto", threads: int | None = None
+    run: str | Path | None = None,
+    checkpoint: str = "last",
+    device: str = "auto",
+    threads: int | None = None,
+    trust: bool = False,
 ) -> Agent:
     """The trained agent of a run.
 
@@ -381,6 +385,7 @@ def load_agent(
         device: as in the config.
         threads: CPU threads of PyTorch, for the whole process; None leaves them. With more than one a decision may be
             faster, and sums may have another order.
+        trust: let modules that the run names be imported although this user did not make it (SECURITY.md).
 
     Raises:
         RunFolderError: no such run.
@@ -399,7 +404,7 @@ def load_agent(
     """
     if threads is not None:
         torch.set_num_threads(threads)
-    folder = open_run(run)
+    folder = open_run(run, trust=trust)
     config = folder.config()
     suite = make_suite(config.tasks)
     step, weights = folder.checkpoints().load_model(checkpoint)
@@ -415,6 +420,7 @@ def evaluate(
     checkpoint: str = "last",
     save: bool = True,
     note: Callable[[str], None] | None = None,
+    trust: bool = False,
     **protocol: Any,
 ) -> Evaluation:
     """Evaluate a run's agent and the random policy.
@@ -425,12 +431,13 @@ def evaluate(
         checkpoint: ``last`` or ``best``.
         save: write JSON and CSV to the run's ``evaluations/``.
         note: receives what the user should know meanwhile: episodes that do not end.
+        trust: as for ``load_agent``.
         protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.
 
     Raises:
         SwitchMTError: no run, no checkpoint, no such task, or a protocol out of range.
     """
-    folder = open_run(run)
+    folder = open_run(run, trust=trust)
     agent = load_agent(folder.path, checkpoint)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)

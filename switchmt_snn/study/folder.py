@@ -6,6 +6,8 @@ and what the report writes: tables.md  study.json  trials.csv  scores.csv  decis
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -14,11 +16,12 @@ from typing import Any
 
 import filelock
 
-from switchmt_snn.config import ExperimentConfig, differences, load_config, to_yaml
+from switchmt_snn.config import ExperimentConfig, differences, load_config, to_dict, to_yaml
+from switchmt_snn.config.trust import SIGNATURE, allow, is_signed, modules_in, require_trusted, signature_of
 from switchmt_snn.errors import ConfigError, RunFolderError, SwitchMTError
 from switchmt_snn.runs.files import json_text, parsed_json, write_atomically, writing
 from switchmt_snn.runs.folder import RunFolder, locked
-from switchmt_snn.study.grid import Study, Trial
+from switchmt_snn.study.grid import Study, Trial, folder_name
 
 STUDIES = Path("runs") / "studies"
 _TAIL_BYTES = 65_536
@@ -148,13 +151,16 @@ class StudyFolder:
             stored = parsed_json(path.read_bytes())
             trials = tuple(
                 Trial(
-                    name=str(one["name"]),
+                    name=folder_name(one["name"]),
                     variant=str(one["variant"]),
                     seed=int(one["seed"]),
-                    config=load_config(self.path / "configs" / f"{one['name']}.yaml"),
+                    config=load_config(self.path / "configs" / f"{one['name']}.yaml", stored=True),
                 )
                 for one in stored["trials"]
             )
+            modules = _modules_of(trials)
+            if is_signed(modules, stored.get(SIGNATURE)):
+                allow(modules)
             return Study(str(stored["name"]), trials, dict(stored["references"]), str(stored["baseline"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected a study's list of trials") from error
@@ -212,6 +218,28 @@ _BEGINNING = {"study.lock", "trials", "configs", "logs"}
 """What a study that was killed while its folder was made may have left."""
 
 
+def require_trusted_trials(trials: Iterable[Trial]) -> None:
+    """Refuse trials with modules that this user does not trust: their processes are given configs, which they trust.
+
+    Raises:
+        UntrustedError: naming the folder and its modules.
+    """
+    require_trusted(_modules_of(trials))
+
+
+def _modules_of(trials: Iterable[Trial]) -> tuple[str, ...]:
+    """Modules outside this package that trials name."""
+    return modules_in([to_dict(trial.config) for trial in trials])
+
+
+def _signature(study: Study) -> dict[str, str]:
+    """What says that this user made the study; nothing if it names no module, or no key can be kept."""
+    modules = _modules_of(study.trials)
+    with suppress(OSError):
+        return {SIGNATURE: signature_of(modules)} if modules else {}
+    return {}
+
+
 def _listed(study: Study) -> dict[str, Any]:
     trials = [{"name": one.name, "variant": one.variant, "seed": one.seed} for one in study.trials]
     return {
@@ -220,6 +248,7 @@ def _listed(study: Study) -> dict[str, Any]:
         "baseline": study.baseline,
         "references": study.references,
         "trials": trials,
+        **_signature(study),
     }
 
 

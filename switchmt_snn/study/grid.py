@@ -18,6 +18,7 @@ from typing import Any
 from switchmt_snn.config import ExperimentConfig, differences, from_dict, load_config, resolve, to_dict
 from switchmt_snn.config.checks import require
 from switchmt_snn.config.strict_yaml import parse_yaml, read_text
+from switchmt_snn.config.trust import allow, modules_in
 from switchmt_snn.errors import ConfigError, did_you_mean, printable
 
 MOST_TRIALS = 10_000
@@ -127,6 +128,7 @@ def load_study(source: str | Path, overrides: Sequence[str] = (), seeds: Sequenc
         require(study.baseline in variants, "baseline", study.baseline, f"one of {', '.join(variants)}")
     except ConfigError as error:
         raise error if str(error).startswith(where) else ConfigError(f"{where}: {error}") from None
+    allow(set(modules_in([to_dict(trial.config) for trial in study.trials])) - set(modules_in(to_dict(base))))
     return study
 
 
@@ -304,6 +306,17 @@ def _short_keys(keys: Iterable[str]) -> dict[str, str]:
 def _slug(value: Any) -> str:
     text = "-".join(map(str, value)) if isinstance(value, list) else "null" if value is None else str(value)
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text)
+
+
+def folder_name(name: Any) -> str:
+    """The name of a stored trial: part of a path, and never of another folder.
+
+    Raises:
+        ValueError: it is no such name.
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise ValueError(f"{name!r:.40} is no name of a trial")
+    return name
 
 
 def _require_name(name: Any, key: str) -> None:

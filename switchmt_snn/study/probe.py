@@ -137,7 +137,7 @@ def _measure(trial: Trial, folder: Path, stop: threading.Event, note: Callable[[
     logs = sum((run / name).stat().st_size for name in ("episodes.csv", "switches.csv") if (run / name).is_file())
     whole = folder_bytes(run)
     episodes = min(config.evaluation.episodes, config.evaluation.num_envs)
-    words = ["evaluate", str(run), "--episodes", str(episodes), "--json"]
+    words = ["evaluate", str(run), "--episodes", str(episodes), "--json", "--trust"]
     process = _Process(words, config, folder / "log", trial, stop)
     process.wait()
     return Pace(

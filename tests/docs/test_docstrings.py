@@ -13,6 +13,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.config import load_config
 from switchmt_snn.config.numbers import exact, whole_number
 from switchmt_snn.config.other_names import meant
+from switchmt_snn.config.trust import modules_in
 from switchmt_snn.drawing.chart import ticks
 from switchmt_snn.drawing.numbers import bytes_of, compact, duration
 from switchmt_snn.errors import printable, shown
@@ -42,6 +43,7 @@ from switchmt_snn.viewing.report.page import write_report
 
 EXAMPLES: tuple[Any, ...] = (
     load_config,
+    modules_in,
     exact,
     whole_number,
     ticks,
