@@ -66,6 +66,9 @@ def run_program() -> None:
         if stop.code == _INTERRUPTED:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
         raise
+    except KeyboardInterrupt:  # while ``main`` begins, or answers the first
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)
 
 
 def _main(argv: list[str]) -> int:
@@ -77,7 +80,9 @@ def _main(argv: list[str]) -> int:
         return 0
     try:
         return _called(argv[0], argv[1:])
-    except KeyboardInterrupt:  # also of the imports
+    except (KeyboardInterrupt, RuntimeError) as error:  # also of the imports
+        if isinstance(error, RuntimeError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise  # a Ctrl-C while a class is made (__set_name__) is the cause of one, up to Python 3.11
         print("switchmt-snn: interrupted", file=sys.stderr)
         return _INTERRUPTED
 

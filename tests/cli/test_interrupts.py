@@ -20,6 +20,35 @@ builtins.__import__ = interrupted
 sys.argv = ["switchmt-snn", "describe", "quickstart"]
 {then}
 """
+BEGUN = """
+import runpy, signal, sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == {moment!r}:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+sys.argv[1:] = ["--version"]
+runpy.run_module("switchmt_snn", run_name="__main__")
+"""
+ANSWERING = """
+import signal, sys
+from switchmt_snn.cli import entry, run_program
+entry._main = lambda argv: signal.raise_signal(signal.SIGINT)
+run_program()
+"""
+WRAPPED = """
+import signal
+from switchmt_snn.cli import entry, run_program
+def called(*_):
+    class Name:
+        def __set_name__(self, *_):
+            signal.raise_signal(signal.SIGINT)
+    class Owner:
+        name = Name()
+entry._called = called
+entry.sys.argv[1:] = ["describe"]
+run_program()
+"""
 CALLED = """
 try:
     main()
@@ -34,6 +63,27 @@ TWICE = "import atexit; atexit.register(signal.raise_signal, signal.SIGINT)"
 def test_ctrl_c_while_a_command_is_imported_is_one_line(moment: str) -> None:
     run = _ran(PROGRAM.format(moment=moment, then="run_program()"))
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "switchmt-snn: interrupted\n")
+
+
+@pytest.mark.parametrize("moment", ["switchmt_snn.cli", "switchmt_snn.cli.entry"])
+def test_ctrl_c_in_the_first_import_is_one_line(moment: str) -> None:
+    run = _ran(BEGUN.format(moment=moment))
+    assert (run.returncode, run.stdout, run.stderr) == (130, "", "switchmt-snn: interrupted\n")
+
+
+def test_ctrl_c_while_the_first_one_is_answered_ends_it_without_a_traceback() -> None:
+    run = _ran(ANSWERING)
+    assert (run.returncode, run.stdout, run.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_ctrl_c_that_python_wraps_in_another_error_is_one_line() -> None:
+    run = _ran(WRAPPED)
+    assert (run.returncode, run.stdout, run.stderr) == (130, "", "switchmt-snn: interrupted\n")
+
+
+def test_nothing_is_imported_before_a_ctrl_c_can_be_answered() -> None:
+    told = "import importlib.util, sys; known = {*sys.modules}; import switchmt_snn; print({*sys.modules} - known)"
+    assert _ran(told).stdout == "{'switchmt_snn'}\n"
 
 
 @pytest.mark.slow
