@@ -73,6 +73,8 @@ class EvaluationProtocol:
         environment: the suite's conditions of play in words, as ``sticky actions 0.25``, and what tasks have become
             (``tasks.later_names``).
         score: what is summed.
+        statistics_batches: from so many batches of each task's replay the normalisation statistics were estimated anew;
+            0: they are those stored with the weights.
     """
 
     episodes: int
@@ -83,6 +85,7 @@ class EvaluationProtocol:
     environment: tuple[str, ...] = ()
     score: str = "raw return, unclipped"
     max_episode_steps: int = EvaluationConfig.max_episode_steps
+    statistics_batches: int = 0
 
     @classmethod
     def of(cls, evaluation: EvaluationConfig, tasks: TasksConfig, step: int = 0) -> EvaluationProtocol:
@@ -117,6 +120,8 @@ class EvaluationProtocol:
         ]
         if self.max_episode_steps != EvaluationConfig.max_episode_steps:
             played.append(f"episodes of at most {self.max_episode_steps:,} steps")
+        if self.statistics_batches:
+            played.append(f"normalisation statistics estimated anew from {self.statistics_batches} batches")
         return ", ".join([*played, *self.environment])
 
 

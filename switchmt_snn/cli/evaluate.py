@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from switchmt_snn.cli.parsing import parse, split_one
+from switchmt_snn.errors import ConfigError
 from switchmt_snn.viewing import output
 
 
@@ -31,6 +32,9 @@ class EvaluateOptions:
     runtime: Literal["torch", "onnx", "nir"] = "torch"
     """What plays. torch: the trained network. onnx: the run's ONNX file in onnxruntime. nir: its NIR files in the NIR
     interpreter."""
+    reestimate_batches: int = 0
+    """Estimate normalisation statistics anew, from so many batches of each task's replay: tells a task that is
+    forgotten from one whose statistics are old."""
     trust: bool = False
     """Import modules that the run names, although you did not make it: this runs their code."""
     json: bool = False
@@ -41,6 +45,7 @@ def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     run, rest = split_one(EvaluateOptions, argv, "evaluate", EvaluateOptions())
     options = parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
+    from switchmt_snn.runs.folder import RunFolder
     from switchmt_snn.runs.packing import open_run
     from switchmt_snn.runs.run import evaluate
     from switchmt_snn.viewing.progress_bar import ProgressBars
@@ -52,8 +57,16 @@ def command(argv: list[str]) -> int:
     facts: dict[str, Any] = {}
     if options.runtime == "torch":
         with ProgressBars():
-            evaluation = evaluate(path, options.task, options.checkpoint, note=_say, **protocol)
+            batches = options.reestimate_batches
+            evaluation = evaluate(
+                path, options.task, options.checkpoint, note=_say, reestimate_batches=batches, **protocol
+            )
     else:
+        if options.reestimate_batches:
+            raise ConfigError(
+                f"--reestimate-batches is {options.reestimate_batches}, expected 0 with --runtime {options.runtime}: "
+                "exported files keep the statistics that they were written with"
+            )
         from switchmt_snn.export.export_run import evaluate_exported
 
         with ProgressBars():
@@ -68,7 +81,8 @@ def command(argv: list[str]) -> int:
         print(f"played by {options.runtime}; {share:.2%} of its decisions are those of the trained network")
         print(path / "export" / "evaluations")
     else:
-        print(path / "evaluations")
+        run_folder = RunFolder(path)
+        print((run_folder.reestimated_evaluations if options.reestimate_batches else run_folder.evaluations).folder)
     return 0
 
 

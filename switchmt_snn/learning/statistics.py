@@ -9,9 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from switchmt_snn.replay.on_device import to_device
+from switchmt_snn.replay.ring import FrameReplay, Returns
 from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
@@ -31,6 +34,27 @@ def reestimate_statistics(network: QNetwork, task: int, batches: Iterable[Tensor
     for count, observations in enumerate(batches, start=1):
         with _momentum(network, 1.0 / count):  # the mean over the batches so far
             network.values(network.encode(observations, generator), network.context(task), training=True)
+
+
+def reestimate_from_replay(
+    network: QNetwork, task: int, replay: FrameReplay, batches: int, batch_size: int, seed: tuple[int, ...]
+) -> None:
+    """As ``reestimate_statistics``, from observations drawn from the task's replay.
+
+    Args:
+        network: gets the statistics of its present weights.
+        task: task index k.
+        replay: the task's.
+        batches: how many.
+        batch_size: observations B of one.
+        seed: of the draws and of the encoding's random numbers; the same seed draws the same.
+    """
+    device = next(network.parameters()).device
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
+    drawn = (replay.sample(batch_size, rng, Returns()).observations for _ in range(batches))
+    tensors = (x if isinstance(x, Tensor) else to_device(x, device) for x in drawn)
+    reestimate_statistics(network, task, tensors, generator)
 
 
 @contextmanager

@@ -27,9 +27,8 @@ from switchmt_snn.learning.parts import make_learner, make_replay
 from switchmt_snn.learning.return_scale import make_return_scales
 from switchmt_snn.learning.saved_values import require_sound
 from switchmt_snn.learning.state import Stateful
-from switchmt_snn.learning.statistics import reestimate_statistics
+from switchmt_snn.learning.statistics import reestimate_from_replay
 from switchmt_snn.learning.switching import EpisodeRecord, Stay, SwitchingPolicy, SwitchTo
-from switchmt_snn.replay.on_device import to_device
 from switchmt_snn.replay.ring import Returns
 from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.tasks.play import Play, episode_seed
@@ -296,14 +295,8 @@ class Training(Stateful):
         learning, replay = self.config.learning, self.replays[task]
         if learning.reestimate_statistics_batches == 0 or self.is_warming_up(task):
             return
-        rng = np.random.default_rng((self.config.seed, self.steps, task))
-        generator = torch.Generator(self.learner.device).manual_seed(int(rng.integers(2**62)))
-        drawn = (
-            replay.sample(learning.batch_size, rng, Returns()).observations
-            for _ in range(learning.reestimate_statistics_batches)
-        )
-        batches = (x if isinstance(x, Tensor) else to_device(x, self.learner.device) for x in drawn)
-        reestimate_statistics(network, task, batches, generator)
+        batches, seed = learning.reestimate_statistics_batches, (self.config.seed, self.steps, task)
+        reestimate_from_replay(network, task, replay, batches, learning.batch_size, seed)
 
     def _begin_episodes(self) -> None:
         """Start an episode in every copy of the current task that has none."""

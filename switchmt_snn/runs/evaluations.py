@@ -28,7 +28,8 @@ def evaluation_name(evaluation: Evaluation) -> str:
     protocol = evaluation.protocol
     tasks = file_name(*sorted({row.task for row in evaluation.tasks}))
     played = f"n{protocol.episodes}_seed{protocol.seed}_epsilon{exact(protocol.epsilon)}_envs{protocol.num_envs}"
-    return f"{_step_name(evaluation.step)}_{tasks}_{played}"
+    statistics = f"_statistics{protocol.statistics_batches}" if protocol.statistics_batches else ""
+    return f"{_step_name(evaluation.step)}_{tasks}_{played}{statistics}"
 
 
 class Evaluations:

@@ -16,7 +16,6 @@ from typing import Any
 
 import filelock
 
-from switchmt_snn.acting.evaluation import Evaluation
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_dict, to_yaml
 from switchmt_snn.config.bounds import LARGEST
 from switchmt_snn.config.trust import allow, modules_in
@@ -197,6 +196,11 @@ class RunFolder:
         """The run's evaluations."""
         return Evaluations(self.path / "evaluations")
 
+    @property
+    def reestimated_evaluations(self) -> Evaluations:
+        """The run's evaluations with normalisation statistics estimated anew: not of the weights as they are stored."""
+        return Evaluations(self.path / "evaluations" / "reestimated")
+
     def create(self, config: ExperimentConfig, environment: dict[str, Any], asked: ExperimentConfig) -> None:
         """Make the folder of a new run.
 
@@ -250,10 +254,6 @@ class RunFolder:
             return False
         lock.release()
         return False
-
-    def save_evaluation(self, evaluation: Evaluation) -> Path:
-        """Write a summary (JSON) and the episodes (CSV) of an evaluation; returns the CSV's path."""
-        return self.evaluations.save(evaluation)
 
     def initial_and_recent_returns(self, episodes: int) -> dict[str, tuple[list[float], list[float]]]:
         """First and newest training returns of each task, ``episodes`` each, from episodes.csv."""

@@ -85,7 +85,8 @@ class RandomPlay:
 def _facts(config: ExperimentConfig, protocol: EvaluationProtocol) -> dict[str, Any]:
     """Everything that decides random episodes of all tasks of a run, as JSON gives it back."""
     suite = suite_of(config.tasks)
-    played = {name: value for name, value in asdict(protocol).items() if name != "epsilon"}
+    of_the_agent = ("epsilon", "statistics_batches")
+    played = {name: value for name, value in asdict(protocol).items() if name not in of_the_agent}
     settings = {field.name: getattr(config.tasks, field.name) for field in fields(config.tasks)}
     settings.pop("num_envs")  # of training; the protocol has its own
     folder = Path(tasks_package.__file__ or "").parent

@@ -27,6 +27,7 @@ from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.environment import describe_environment, signature_facts
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
+from switchmt_snn.runs.fresh_statistics import with_fresh_statistics
 from switchmt_snn.runs.history import read_history
 from switchmt_snn.runs.initial_weights import InitialWeights, read_initial_weights
 from switchmt_snn.runs.logs import RunLogs
@@ -361,7 +362,7 @@ class _Driver:
         self._note(f"evaluating: {protocol}")
         known = RandomPlay(self.folder.path, self.config, suite, protocol)
         evaluation = evaluate_agent(agent, protocol, note=self._note, stop=stop, random_play=known)
-        self.folder.save_evaluation(evaluation)
+        self.folder.evaluations.save(evaluation)
         self.best.at_evaluation(evaluation, agent.network)
         return evaluation
 
@@ -420,6 +421,7 @@ def evaluate(
     checkpoint: str = "last",
     save: bool = True,
     note: Callable[[str], None] | None = None,
+    reestimate_batches: int = 0,
     trust: bool = False,
     **protocol: Any,
 ) -> Evaluation:
@@ -431,20 +433,25 @@ def evaluate(
         checkpoint: ``last`` or ``best``.
         save: write JSON and CSV to the run's ``evaluations/``.
         note: receives what the user should know meanwhile: episodes that do not end.
+        reestimate_batches: estimate the normalisation statistics anew from so many batches of each task's replay; the
+            files then go to ``evaluations/reestimated/``. 0 takes the stored ones.
         trust: as for ``load_agent``.
         protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.
 
     Raises:
-        SwitchMTError: no run, no checkpoint, no such task, or a protocol out of range.
+        SwitchMTError: no run, checkpoint or task of that name, a protocol out of range, no replay to estimate from.
     """
     folder = open_run(run, trust=trust)
     agent = load_agent(folder.path, checkpoint)
+    if reestimate_batches != 0:
+        agent = with_fresh_statistics(agent, folder, reestimate_batches)
     settings = replace(agent.config.evaluation, **protocol)
     tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
     conditions = EvaluationProtocol.of(settings, agent.config.tasks, agent.step)
+    conditions = replace(conditions, statistics_batches=reestimate_batches)
     folder = open_run(folder.path, to_write=save)
     known = RandomPlay(folder.path, agent.config, agent.suite, conditions) if save else None
     evaluation = evaluate_agent(agent, conditions, tasks, note, random_play=known)
     if save:
-        folder.save_evaluation(evaluation)
+        (folder.reestimated_evaluations if reestimate_batches else folder.evaluations).save(evaluation)
     return evaluation

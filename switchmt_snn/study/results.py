@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from switchmt_snn.acting.evaluation import EvaluationProtocol
+from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.study.folder import StudyFolder, TrialRun
 from switchmt_snn.study.grid import Study, Trial
 from switchmt_snn.viewing.report.sources import Sources, read_sources
@@ -29,6 +30,7 @@ class TaskResult:
             share them.
         visits: how often the task was entered.
         curve: step and mean return of the evaluations during training, and last of the final one.
+        reestimated: as ``mean``, with normalisation statistics estimated anew; None if that was not evaluated.
     """
 
     trial: str
@@ -43,6 +45,7 @@ class TaskResult:
     updates: int
     visits: int
     curve: tuple[tuple[int, float], ...]
+    reestimated: float | None
 
 
 @dataclass(frozen=True)
@@ -76,11 +79,13 @@ def read_results(study: Study, folder: StudyFolder) -> list[TrialResult]:
     for trial in study.trials:
         final = TrialRun(folder.run(trial)).final
         if final is not None:
-            found.append(_result(trial, read_sources(folder.run(trial)), final))
+            path = folder.run(trial)
+            fresh = _reestimated(RunFolder(path).reestimated_evaluations.all(), final)
+            found.append(_result(trial, read_sources(path), final, fresh))
     return found
 
 
-def _result(trial: Trial, run: Sources, final: dict[str, Any]) -> TrialResult:
+def _result(trial: Trial, run: Sources, final: dict[str, Any], fresh: dict[str, float]) -> TrialResult:
     stays = visits(run)
     counted = [(one.step, one.updates) for one in run.history.episodes]
     counted = sorted({*counted, *((one.step, one.updates) for one in run.history.measured)})
@@ -104,6 +109,7 @@ def _result(trial: Trial, run: Sources, final: dict[str, Any]) -> TrialResult:
                 updates=sum(_updates_at(counted, visit.end) - _updates_at(counted, visit.begin) for visit in own),
                 visits=len(own),
                 curve=_curve(run, final, task),
+                reestimated=fresh.get(task),
             )
         )
     return TrialResult(
@@ -135,6 +141,20 @@ def _curve(run: Sources, final: dict[str, Any], task: str) -> tuple[tuple[int, f
             points[int(one["step"])] = mean
     last = _mean(final, task)
     return tuple(sorted(points.items())) + (() if last is None else ((int(final["step"]), last),))
+
+
+def _reestimated(evaluations: Sequence[dict[str, Any]], final: dict[str, Any]) -> dict[str, float]:
+    """Mean return by task in the evaluations with fresh statistics that have the final one's step, episodes and seed.
+
+    Of several, the one of most batches counts.
+    """
+    keys = ("episodes", "epsilon", "seed")
+    found: dict[str, float] = {}
+    for one in sorted(evaluations, key=lambda one: int(one["protocol"]["statistics_batches"])):
+        same = all(one["protocol"].get(key) == final["protocol"].get(key) for key in keys)
+        if same and one["step"] == final["step"]:
+            found |= {row["task"]: float(row["mean"]) for row in one["tasks"] if row["policy"] == "agent"}
+    return found
 
 
 def _mean(evaluation: dict[str, Any], task: str) -> float | None:

@@ -291,16 +291,25 @@ def _over_training(found: Results) -> Table | None:
     def lost(row: TaskResult) -> float | None:
         return float(statistics.forgetting([mean for _, mean in row.curve])) if len(row.curve) > 1 else None
 
-    rows = [(name, *_by_task(found, name, area), *_by_task(found, name, lost)) for name in found.variants]
-    return Table(
-        name="training",
-        title="Over training",
-        note="Of the evaluations during training. Area: mean score over the steps (area under the curve). Lost: best "
-        "earlier score minus the final one; a best over noisy evaluations is too high, so compare variants only.",
-        columns=(
-            "variant",
-            *(f"area {task}" for task in found.tasks),
-            *(f"lost {task}" for task in found.tasks),
-        ),
-        rows=tuple(rows),
+    def lost_with_fresh_statistics(row: TaskResult) -> float | None:
+        if row.reestimated is None or len(row.curve) < 2:
+            return None
+        return float(statistics.forgetting([*(mean for _, mean in row.curve[:-1]), row.reestimated]))
+
+    measures = {"area": area, "lost": lost}
+    note = (
+        "Of the evaluations during training. Area: mean score over the steps (area under the curve). Lost: best "
+        "earlier score minus the final one; a best over noisy evaluations is too high, so compare variants only."
     )
+    if any(row.reestimated is not None for one in found.results for row in one.tasks):
+        measures["lost with fresh statistics"] = lost_with_fresh_statistics
+        note += (
+            " With fresh statistics: the final network's normalisation statistics were estimated anew from the "
+            "replays (evaluate --reestimate-batches): what is then not lost was not forgotten by the weights."
+        )
+    rows = [
+        (name, *(value for measure in measures.values() for value in _by_task(found, name, measure)))
+        for name in found.variants
+    ]
+    columns = ("variant", *(f"{measure} {task}" for measure in measures for task in found.tasks))
+    return Table(name="training", title="Over training", note=note, columns=columns, rows=tuple(rows))

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from switchmt_snn import load_agent, train
+from switchmt_snn import evaluate, load_agent, train
+from switchmt_snn.acting.evaluation import EvaluationProtocol
+from switchmt_snn.cli.entry import main
 from switchmt_snn.config import ExperimentConfig, from_dict
+from switchmt_snn.errors import CheckpointError, ConfigError, RunFolderError
 from switchmt_snn.learning.events import Event, Stepped
 from switchmt_snn.runs import run as runs
+from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.fresh_statistics import with_fresh_statistics
+from switchmt_snn.runs.packing import pack
 
 CONFIG: ExperimentConfig = from_dict(
     {
@@ -26,7 +34,7 @@ CONFIG: ExperimentConfig = from_dict(
             "reestimate_statistics_batches": 3,
         },
         "switching": {"policy": "fixed_steps", "visit_steps": 40},
-        "evaluation": {"episodes": 1, "every_steps": 60},
+        "evaluation": {"episodes": 1, "every_steps": 60, "max_episode_steps": 30},
         "recording": {"checkpoint_every_steps": 50},
     }
 )
@@ -91,3 +99,51 @@ def test_the_evaluated_network_is_the_stored_one_also_after_crashes(
     assert train(CONFIG, tmp_path / "cut").status == "finished"
     assert_equal(evaluated[-1], evaluated[3])
     assert_equal(network_of(tmp_path / "cut"), evaluated[3])
+
+
+def test_statistics_estimated_afterwards_are_those_that_training_would_estimate(tmp_path: Path) -> None:
+    run = RunFolder(train(CONFIG, tmp_path / "run").path)
+    agent = load_agent(run.path)
+    stored = {name: tensor.clone() for name, tensor in agent.network.state_dict().items()}
+    assert_equal(with_fresh_statistics(agent, run, 3).network.state_dict(), stored)
+    others = with_fresh_statistics(load_agent(run.path), run, 2).network.state_dict()
+    changed = {name.rsplit(".", 1)[-1] for name, tensor in others.items() if not torch.equal(tensor, stored[name])}
+    assert changed == {"running_mean_KC", "running_var_KC"}
+
+
+def test_evaluations_with_fresh_statistics_are_kept_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = train(replace(CONFIG, total_steps=60), tmp_path / "run").path
+    before = RunFolder(run).evaluations.all()
+    with pytest.raises(SystemExit) as ended:
+        main(["evaluate", str(run), "--reestimate-batches", "2", "--json"])
+    assert ended.value.code == 0
+    played = json.loads(capsys.readouterr().out)
+    assert played["protocol"]["statistics_batches"] == 2
+    assert RunFolder(run).evaluations.all() == before
+    (kept,) = RunFolder(run).reestimated_evaluations.all()
+    assert kept["tasks"] == played["tasks"]
+    assert str(EvaluationProtocol.from_dict(kept["protocol"])).endswith(
+        "normalisation statistics estimated anew from 2 batches"
+    )
+
+
+def test_statistics_that_cannot_be_estimated_are_refused_in_one_line(tmp_path: Path) -> None:
+    run = RunFolder(train(replace(CONFIG, total_steps=60), tmp_path / "run").path)
+    agent = load_agent(run.path)
+    agent.step = 40
+    with pytest.raises(RunFolderError, match="the weights are of step 40 and the replay is of step 60, expected those"):
+        with_fresh_statistics(agent, run, 2)
+    with pytest.raises(ConfigError, match="from -1 batches, expected at least 1"):
+        evaluate(run.path, reestimate_batches=-1)
+    pack(run.path, tmp_path / "packed")
+    with pytest.raises(CheckpointError, match="holds weights only"):
+        evaluate(tmp_path / "packed", reestimate_batches=2)
+    plain = replace(CONFIG.network, mlp_normalization="none", stream_normalization="none")
+    learning = replace(CONFIG.learning, reestimate_statistics_batches=0)
+    none = train(replace(CONFIG, total_steps=30, network=plain, learning=learning), tmp_path / "none").path
+    with pytest.raises(ConfigError, match="the network has no normalisation, expected one whose"):
+        evaluate(none, reestimate_batches=2)
+    shared = replace(CONFIG.network, normalization="shared")
+    one = train(replace(CONFIG, total_steps=30, network=shared, learning=learning), tmp_path / "shared").path
+    with pytest.raises(ConfigError, match=r"network\.normalization is shared, expected per_task"):
+        evaluate(one, reestimate_batches=2)

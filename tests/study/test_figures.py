@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +13,13 @@ import pytest
 
 from switchmt_snn.drawing.chart import Chart, Timeline
 from switchmt_snn.drawing.files import figure_files
+from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.study import report
 from switchmt_snn.study.figures import THRESHOLDS, study_figures
-from switchmt_snn.study.folder import StudyFolder
+from switchmt_snn.study.folder import StudyFolder, TrialRun
 from switchmt_snn.study.grid import Study
 from switchmt_snn.study.results import TrialResult, read_results
+from switchmt_snn.study.tables import study_tables
 from tests.study.test_report import GAMES, finished
 from tests.viewing.test_run_report import Page
 
@@ -87,6 +90,39 @@ def test_a_matrix_is_what_each_task_lost_since_its_best(
 
 
 @pytest.mark.slow
+def test_what_fresh_statistics_restore_stands_beside_what_was_lost(
+    evaluated: tuple[Study, StudyFolder, list[TrialResult]], tmp_path: Path
+) -> None:
+    """A trial that was evaluated with fresh statistics twice: the more batches count, and nothing else changes."""
+    study, folder, results = evaluated
+    first = results[0]
+    run = RunFolder(shutil.copytree(folder.run(first.trial), tmp_path / "trials" / first.trial.name))
+    final = TrialRun(run.path).final
+    assert final is not None
+    run.reestimated_evaluations.folder.mkdir()
+    for batches, gain in ((16, 1.0), (2, 50.0)):
+        protocol = {**final["protocol"], "statistics_batches": batches}
+        tasks = [{**row, "mean": row["mean"] + gain} for row in final["tasks"]]
+        path = run.reestimated_evaluations.folder / f"step-{final['step']:012d}_{batches}.json"
+        path.write_text(json.dumps({"step": final["step"], "protocol": protocol, "tasks": tasks}))
+    alone = Study(study.name, (first.trial,), {}, first.trial.variant)
+    (found,) = read_results(alone, StudyFolder(tmp_path))
+    assert [row.reestimated for row in found.tasks] == [row.mean + 1.0 for row in found.tasks]
+    assert [replace(row, reestimated=None, curve=()) for row in found.tasks] == [
+        replace(row, curve=()) for row in first.tasks
+    ]
+    drawn = replace(
+        first,
+        tasks=tuple(replace(row, reestimated=row.mean + 1.0) for row in first.tasks),
+    )
+    table = next(one for one in study_tables(alone, [drawn]) if one.name == "training")
+    cells = dict(zip(table.columns, table.rows[0], strict=True))
+    for row in first.tasks:
+        earlier = max(mean for _, mean in row.curve[:-1])
+        assert cells[f"lost with fresh statistics {row.task}"].value == pytest.approx(earlier - row.mean - 1.0)
+        assert cells[f"lost {row.task}"].value == pytest.approx(earlier - row.curve[-1][1])
+
+
 def test_without_curves_references_or_switches_a_figure_is_left_out(
     evaluated: tuple[Study, StudyFolder, list[TrialResult]],
 ) -> None:
