@@ -23,7 +23,7 @@ from switchmt_snn.learning.learner import Learner
 from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.replay.ring import FrameReplay, Returns
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import make_suite

@@ -36,7 +36,7 @@ from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.model_card import CARD, model_card
 from switchmt_snn.runs.packing import open_run
 from switchmt_snn.runs.random_play import RandomPlay
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, quantized
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite

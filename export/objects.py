@@ -21,7 +21,7 @@ from switchmt_snn.export.formats.onnx_writer import decision_model, step_model
 from switchmt_snn.export.parity.compare import Exports
 from switchmt_snn.export.parity.proof import prove
 from switchmt_snn.export.recording import play
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork, fold, quantized
 from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite

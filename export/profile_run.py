@@ -39,7 +39,7 @@ from switchmt_snn.machine.progress import progress_of
 from switchmt_snn.runs.environment import command_line
 from switchmt_snn.runs.files import json_text, made, write_atomically, writing
 from switchmt_snn.runs.packing import open_run
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from switchmt_snn.tasks.registry import suite_of
 
 MAX_DECISIONS = 10**7

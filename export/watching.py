@@ -22,7 +22,7 @@ from switchmt_snn.export.parity.activity import active_neurons
 from switchmt_snn.export.parity.compare import Trace, trace_nir, trace_onnx
 from switchmt_snn.export.runtimes.agents import NirAgent, OnnxAgent, encode, existing_only
 from switchmt_snn.runs.packing import open_run
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from switchmt_snn.spiking.folding import FoldedNetwork
 
 Tracer = Callable[[npt.NDArray[Any], int, int], Trace]

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from switchmt_snn.config import ExperimentConfig
     from switchmt_snn.config.yaml_io import load_config
-    from switchmt_snn.runs.run import evaluate, load_agent, train
+    from switchmt_snn.runs.run import train
+    from switchmt_snn.runs.trained import evaluate, load_agent
     from switchmt_snn.tasks.registry import register_suite
     from switchmt_snn.tasks.report import check_env
 
@@ -36,8 +37,8 @@ __all__ = [
 _HOMES = {
     "ExperimentConfig": "switchmt_snn.config",
     "load_config": "switchmt_snn.config.yaml_io",
-    "evaluate": "switchmt_snn.runs.run",
-    "load_agent": "switchmt_snn.runs.run",
+    "evaluate": "switchmt_snn.runs.trained",
+    "load_agent": "switchmt_snn.runs.trained",
     "register_suite": "switchmt_snn.tasks.registry",
     "check_env": "switchmt_snn.tasks.report",
     "train": "switchmt_snn.runs.run",

@@ -182,7 +182,7 @@ def check_fit(layers: Sequence[LayerShape], chip: Chip | str) -> ChipFit:
 
     Examples:
         >>> from switchmt_snn.export.folded import fold_agent
-        >>> from switchmt_snn.runs.run import load_agent
+        >>> from switchmt_snn.runs.trained import load_agent
         >>> layers = layer_shapes(fold_agent(load_agent("runs/mine")))
         >>> check_fit(layers, "loihi-1").fits
         True

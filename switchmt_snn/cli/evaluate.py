@@ -47,7 +47,7 @@ def command(argv: list[str]) -> int:
     options = parse(EvaluateOptions, rest, "evaluate", EvaluateOptions())
     from switchmt_snn.runs.folder import RunFolder
     from switchmt_snn.runs.packing import open_run
-    from switchmt_snn.runs.run import evaluate
+    from switchmt_snn.runs.trained import evaluate
     from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.tables import evaluation_table
 

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,26 +16,24 @@ from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, Evalu
 from switchmt_snn.config import EvaluationConfig, ExperimentConfig, from_dict, load_config, to_dict
 from switchmt_snn.errors import CheckpointError, TrainingFailed, WriteError
 from switchmt_snn.learning.events import Event, Stepped
-from switchmt_snn.learning.parts import make_learner, observation_spec
+from switchmt_snn.learning.parts import make_learner
 from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training
-from switchmt_snn.machine.devices import keep_freed_memory, select_device
+from switchmt_snn.machine.devices import keep_freed_memory
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
 from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.environment import describe_environment, signature_facts
 from switchmt_snn.runs.folder import RunFolder, check_same_config, claim_new_run
-from switchmt_snn.runs.fresh_statistics import with_fresh_statistics
 from switchmt_snn.runs.history import read_history
 from switchmt_snn.runs.initial_weights import InitialWeights, read_initial_weights
 from switchmt_snn.runs.logs import RunLogs
-from switchmt_snn.runs.packing import open_run, refuse_pretrained
+from switchmt_snn.runs.packing import refuse_pretrained
 from switchmt_snn.runs.plan import decide, plan, with_classes
 from switchmt_snn.runs.random_play import RandomPlay
 from switchmt_snn.runs.signals import stop_requests
-from switchmt_snn.spiking.network import build_network
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import Suite
 from switchmt_snn.updates.processes import ProcessGroup, join_processes
@@ -369,89 +367,3 @@ class _Driver:
     def _note(self, text: str) -> None:
         for observer in self.observers:
             observer.note(text)
-
-
-def load_agent(
-    run: str | Path | None = None,
-    checkpoint: str = "last",
-    device: str = "auto",
-    threads: int | None = None,
-    trust: bool = False,
-) -> Agent:
-    """The trained agent of a run.
-
-    Args:
-        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
-        checkpoint: ``last`` or ``best``.
-        device: as in the config.
-        threads: CPU threads of PyTorch, for the whole process; None leaves them. With more than one a decision may be
-            faster, and sums may have another order.
-        trust: let modules that the run names be imported although this user did not make it (SECURITY.md).
-
-    Raises:
-        RunFolderError: no such run.
-        CheckpointError: no whole checkpoint.
-
-    Examples:
-        A loop of one's own; ``Agent.environment`` plays a task exactly as training does.
-
-        >>> from switchmt_snn import load_agent
-        >>> agent = load_agent("runs/mine")  # the run of train's example
-        >>> env = agent.environment("CartPole-v1")
-        >>> observation, _ = env.reset(seed=1)
-        >>> terminated = truncated = False
-        >>> while not (terminated or truncated):
-        ...     observation, reward, terminated, truncated, _ = env.step(agent.act(observation, "CartPole-v1"))
-    """
-    if threads is not None:
-        torch.set_num_threads(threads)
-    folder = open_run(run, trust=trust)
-    config = folder.config()
-    suite = make_suite(config.tasks)
-    step, weights = folder.checkpoints().load_model(checkpoint)
-    network = build_network(config.network, observation_spec(suite), config.seed)
-    with fitting_weights():
-        network.load_state_dict(weights)
-    return Agent(network, suite.at(step), config, select_device(device), step)
-
-
-def evaluate(
-    run: str | Path | None = None,
-    task: str | None = None,
-    checkpoint: str = "last",
-    save: bool = True,
-    note: Callable[[str], None] | None = None,
-    reestimate_batches: int = 0,
-    trust: bool = False,
-    **protocol: Any,
-) -> Evaluation:
-    """Evaluate a run's agent and the random policy.
-
-    Args:
-        run: run folder, or ``pretrained/NAME``; None takes the newest run under ``runs/``.
-        task: one task's name; None evaluates all.
-        checkpoint: ``last`` or ``best``.
-        save: write JSON and CSV to the run's ``evaluations/``.
-        note: receives what the user should know meanwhile: episodes that do not end.
-        reestimate_batches: estimate the normalisation statistics anew from so many batches of each task's replay; the
-            files then go to ``evaluations/reestimated/``. 0 takes the stored ones.
-        trust: as for ``load_agent``.
-        protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.
-
-    Raises:
-        SwitchMTError: no run, checkpoint or task of that name, a protocol out of range, no replay to estimate from.
-    """
-    folder = open_run(run, trust=trust)
-    agent = load_agent(folder.path, checkpoint)
-    if reestimate_batches != 0:
-        agent = with_fresh_statistics(agent, folder, reestimate_batches)
-    settings = replace(agent.config.evaluation, **protocol)
-    tasks = None if task is None else (agent.suite.names[agent.suite.index(task)],)
-    conditions = EvaluationProtocol.of(settings, agent.config.tasks, agent.step)
-    conditions = replace(conditions, statistics_batches=reestimate_batches)
-    folder = open_run(folder.path, to_write=save)
-    known = RandomPlay(folder.path, agent.config, agent.suite, conditions) if save else None
-    evaluation = evaluate_agent(agent, conditions, tasks, note, random_play=known)
-    if save:
-        (folder.reestimated_evaluations if reestimate_batches else folder.evaluations).save(evaluation)
-    return evaluation

@@ -22,7 +22,8 @@ from switchmt_snn.export.chips.fit import check_fit
 from switchmt_snn.learning.switching import SwitchingPolicy
 from switchmt_snn.replay.ring import FrameReplay
 from switchmt_snn.runs.files import file_name, json_text
-from switchmt_snn.runs.run import load_agent, train
+from switchmt_snn.runs.run import train
+from switchmt_snn.runs.trained import load_agent
 from switchmt_snn.study.grid import load_study
 from switchmt_snn.study.prize import best_split
 from switchmt_snn.study.statistics import (

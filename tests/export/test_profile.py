@@ -22,7 +22,7 @@ from switchmt_snn.export.chips.precision import at_precision, effect_of_precisio
 from switchmt_snn.export.counts.network import count_task
 from switchmt_snn.export.folded import fold_agent
 from switchmt_snn.runs.description import describe_method
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from tests.export.export_cases import VARIANTS, RunCommand, make_agent, observations
 
 

@@ -15,7 +15,8 @@ from safetensors.torch import load_file
 from switchmt_snn.config import load_config
 from switchmt_snn.errors import ExportError
 from switchmt_snn.export import ExportSettings, export
-from switchmt_snn.runs.run import evaluate, train
+from switchmt_snn.runs.run import train
+from switchmt_snn.runs.trained import evaluate
 from tests.recipes import code_of
 
 FILES = ("my_encodings.py", "own_encoding.yaml", "my_onnx_rule.py", "export_own.py")

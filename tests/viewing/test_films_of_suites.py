@@ -16,7 +16,7 @@ from switchmt_snn.cli import main
 from switchmt_snn.errors import MissingExtraError
 from switchmt_snn.export.parity.activity import active_neurons
 from switchmt_snn.runs.packing import open_run
-from switchmt_snn.runs.run import load_agent
+from switchmt_snn.runs.trained import load_agent
 from tests.viewing.test_film import observed
 
 ROOT = Path(__file__).parents[2]
