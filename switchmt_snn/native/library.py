@@ -23,6 +23,8 @@ from typing import Any
 
 import torch  # noqa: F401  also brings the OpenMP that the sources are linked against
 
+from switchmt_snn.machine.temporary import temporary_beside
+
 _CSRC = Path(__file__).with_name("csrc")
 _HEADER = _CSRC / "numbers.h"
 _SOURCES = tuple(
@@ -93,13 +95,13 @@ def _keep(content: bytes, kept: Path) -> None:
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.parent.chmod(0o700)
     for path, written in ((kept, content), (kept.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())):
-        handle, temporary = tempfile.mkstemp(dir=kept.parent)
+        temporary = temporary_beside(path)
         try:
-            with os.fdopen(handle, "wb") as stream:
+            with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
                 stream.write(written)
-            os.replace(temporary, path)
+            temporary.replace(path)
         finally:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
 def signatures() -> dict[str, list[type[Any]]]:

@@ -7,13 +7,13 @@ import json
 import math
 import os
 import re
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from switchmt_snn.errors import WriteError
+from switchmt_snn.machine.temporary import temporary_beside
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _LONGEST_LIST = 120
@@ -115,12 +115,12 @@ def written_whole(path: Path, option: str | None = None) -> Iterator[Path]:
     """A temporary path beside ``path`` for code that writes a file itself; at the end it takes the file's place.
 
     Each call has another one, because other processes and threads may write the same file. If the code fails, nothing
-    stays of it.
+    stays of it; what stays of a process that is killed, the next one removes (``temporary_beside``).
 
     Raises:
         WriteError: the system refused.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary = temporary_beside(path)
     with writing(path, option):
         try:
             yield temporary

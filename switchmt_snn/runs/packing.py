@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shlex
 import shutil
-import tempfile
 from pathlib import Path
 
 from switchmt_snn.config.trust import SIGNATURE
 from switchmt_snn.errors import RunFolderError, nearest
+from switchmt_snn.machine.temporary import temporary_folder
 from switchmt_snn.runs.files import json_text, write_atomically, writing
 from switchmt_snn.runs.folder import RunFolder, latest_run, read_environment
 from switchmt_snn.runs.model_card import CARD, model_card
@@ -128,8 +128,8 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
     step, weights = folder.checkpoints().load_model(checkpoint)
     with writing(out, "--out", whole=True):
         out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.", suffix=".tmp") as unfinished:
-            packed = RunFolder(Path(unfinished) / out.name)
+        with temporary_folder(out) as unfinished:
+            packed = RunFolder(unfinished / out.name)
             packed.path.mkdir()
             for name in _FILES:
                 if (folder.path / name).is_file():
@@ -157,10 +157,10 @@ def _whole_copy(source: Path, target: Path) -> None:
     """Copy a folder so that it is whole or absent; of two processes that do it at once, one wins."""
     with writing(target, whole=True):
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp") as unfinished:
-            shutil.copytree(source, Path(unfinished) / target.name, copy_function=shutil.copyfile)
+        with temporary_folder(target) as unfinished:
+            shutil.copytree(source, unfinished / target.name, copy_function=shutil.copyfile)
             try:
-                (Path(unfinished) / target.name).rename(target)
+                (unfinished / target.name).rename(target)
             except OSError:
                 if not RunFolder(target).is_run:
                     raise

@@ -163,13 +163,12 @@ def prepared(command: str, folder: Path, finished: Path | None) -> None:
 
 
 def products(folder: Path) -> dict[str, Any]:
-    """What a command leaves, without times: files by path."""
+    """What a command leaves, without times: files by path. Nothing is left of one that was ended before."""
     found = {}
     for path in sorted((folder / "run").rglob("*")):
         name = str(path.relative_to(folder / "run"))
         if (
             path.is_file()
-            and not any(part.endswith(".tmp") for part in Path(name).parts)  # what a killed command had not renamed yet
             and not name.endswith((".lock", ".log", ".zst", ".html", ".svg", ".png"))
             and "environment" not in name
             and name != "attempts.jsonl"  # a study's processes, of which a crash ends one

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.errors import WriteError
+from switchmt_snn.machine.temporary import temporary_beside
 from switchmt_snn.runs.files import json_text, made, write_atomically, writing
 from switchmt_snn.viewing.film.moments import Moment
 from switchmt_snn.viewing.film.panels import Names
@@ -21,7 +22,7 @@ class Record:
     def __init__(self, csv_path: Path, json_path: Path, actions: tuple[str, ...], layers: tuple[str, ...]) -> None:
         self.csv_path, self.json_path = csv_path, json_path
         made(csv_path.parent, "--out")
-        self._temporary = csv_path.with_name(f".{csv_path.name}.{os.getpid()}.tmp")
+        self._temporary = temporary_beside(csv_path)
         with writing(csv_path, "--out"):
             self._stream = self._temporary.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._stream)

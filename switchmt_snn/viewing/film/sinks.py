@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import os
 import subprocess
 import tempfile
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Protocol
 from PIL import Image
 
 from switchmt_snn.errors import ConfigError, MissingExtraError, RunFolderError, TrainingFailed
+from switchmt_snn.machine.temporary import temporary_beside
 from switchmt_snn.runs.files import made, writing
 
 CODERS = {
@@ -56,7 +56,7 @@ class VideoFile:
             MissingExtraError: the package that brings ffmpeg is not installed.
         """
         self._path = path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        self._temporary = temporary_beside(path)
         self._closing = contextlib.ExitStack()
         self._complaints = self._closing.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         shape = f"{size[0]}x{size[1]}"
