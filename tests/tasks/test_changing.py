@@ -6,6 +6,7 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -158,3 +159,20 @@ def test_a_change_that_is_half_stated_is_one_line(change: dict[str, object], lin
 def test_a_later_task_has_the_same_actions() -> None:
     with pytest.raises(TaskError, match="makes 'Acrobot-v1' of 'CartPole-v1', expected a task with the same actions"):
         make_suite(replace(TASKS, later_names=("Acrobot-v1", "Acrobot-v1")))
+
+
+def test_a_held_action_is_eight_steps_of_mountain_car() -> None:
+    held = gymnasium.make("switchmt_snn.tasks.held_mountain_car:HeldMountainCar-v0")
+    plain = gymnasium.make("MountainCar-v0")
+    held.reset(seed=3)
+    plain.reset(seed=3)
+    rng, steps, over, total = np.random.default_rng(0), 0, False, 0.0
+    while not over:
+        action = int(rng.integers(3))
+        observation, reward, terminated, truncated, _ = held.step(action)
+        for _ in range(8):
+            expected, one, *ended, _ = plain.step(action)
+        assert observation.tolist() == expected.tolist()
+        assert (float(reward), [terminated, truncated]) == (8 * float(one), ended)
+        steps, over, total = steps + 1, terminated or truncated, total + float(reward)
+    assert (steps, total) == (25, -200.0)
