@@ -124,7 +124,13 @@ def _matrix(found: Results, name: str, scales: dict[str, tuple[float, float]]) -
         "share of what the task's best variant reached above random play. The last column is the final evaluation."
     )
     return Timeline(
-        f"forgotten_{name}", f"{name}: lost since the best evaluation", STEPS, found.tasks, tuple(spans), end, note
+        f"forgotten_{name}",
+        f"{name}: lost since the best evaluation",
+        STEPS,
+        tuple(map(found.shown, found.tasks)),
+        tuple(spans),
+        end,
+        note,
     )
 
 

@@ -17,6 +17,9 @@ from switchmt_snn.study import statistics
 from switchmt_snn.study.grid import Study
 from switchmt_snn.study.results import TaskResult, TrialResult
 
+SIGNIFICANT = 0.05
+"""Of the decision rule: p after Holm's correction is below it (docs/studies.md)."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -82,6 +85,17 @@ class Results:
         self.variants = tuple(name for name in study.variants if self.of(name))
         self.tasks = tuple(dict.fromkeys(row.task for one in results for row in one.tasks))
 
+    def shown(self, task: str) -> str:
+        """A task's name in a table: without its module, where that still tells it from the others."""
+        short = [name.rsplit(":", 1)[-1] for name in self.tasks]
+        own = task.rsplit(":", 1)[-1]
+        return own if short.count(own) == 1 else task
+
+    @property
+    def finished(self) -> bool:
+        """Whether every trial has finished."""
+        return len(self.results) == len(self.study.trials)
+
     def of(self, variant: str) -> list[TrialResult]:
         """A variant's finished trials by seed."""
         return sorted((one for one in self.results if one.trial.variant == variant), key=lambda one: one.trial.seed)
@@ -101,7 +115,7 @@ def study_tables(study: Study, results: Sequence[TrialResult]) -> list[Table]:
     found = Results(study, results)
     if not results:
         return []
-    made = [_scores(found), _shares(found), _played(found), _over_training(found)]
+    made = [_scores(found), _shares(found), _decision(found), _played(found), _over_training(found)]
     return [table for table in made if table is not None]
 
 
@@ -141,7 +155,7 @@ def _scores(found: Results) -> Table:
         title="Scores",
         note="Raw return of the final network; mean over seeds and its 95 % interval. Protocol: "
         + "; or ".join(protocols),
-        columns=("variant", "seeds", *found.tasks),
+        columns=("variant", "seeds", *map(found.shown, found.tasks)),
         rows=(*rows, ("random play", None, *random)),
     )
 
@@ -217,7 +231,7 @@ def _shares(found: Results) -> Table | None:
             )
         )
     what = "score / reference" if floors is None else "(score - random play) / (reference - random play)"
-    named = ", ".join(f"{task} {digits(references[task])}" for task in tasks)
+    named = ", ".join(f"{found.shown(task)} {digits(references[task])}" for task in tasks)
     baseline = found.study.baseline
     return Table(
         name="shares",
@@ -226,7 +240,7 @@ def _shares(found: Results) -> Table | None:
         f"P(> {baseline}): probability that a seed's harmonic mean is above one of the baseline's. p: of no difference "
         "in the harmonic mean over paired seeds (sign flips), after Holm over the variants; intervals are not "
         "corrected.",
-        columns=("variant", *tasks, "IQM", "minimum", "harmonic mean", f"P(> {baseline})", "p"),
+        columns=("variant", *map(found.shown, tasks), "IQM", "minimum", "harmonic mean", f"P(> {baseline})", "p"),
         rows=tuple(rows),
     )
 
@@ -252,10 +266,42 @@ def _compared(found: Results, harmonic: dict[str, Any]) -> dict[str, tuple[Estim
     return {name: (chances[name], corrected[name]) for name in chances}
 
 
+def _decision(found: Results) -> Table | None:
+    """Whether each variant is preferred to the baseline by the rule of docs/studies.md, and which condition fails."""
+    known = shares_of(found)
+    if known is None:
+        return None
+    harmonic = {name: statistics.harmonic_mean_over_tasks(one) for name, one in known.by_variant.items()}
+    baseline, rows = found.study.baseline, []
+    for name, (chance, p) in _compared(found, harmonic).items():
+        own, base = (_by_task(found, one, lambda row: row.mean) for one in (name, baseline))
+        below = [
+            found.shown(task)
+            for task, mine, theirs in zip(found.tasks, own, base, strict=True)
+            if None not in (mine, theirs) and None not in (mine.high, theirs.low) and mine.high < theirs.low
+        ]
+        improves = chance is not None and chance.low is not None and chance.low > 0.5
+        significant = p is not None and p < SIGNIFICANT
+        verdict = "yes" if improves and significant and not below else "no"
+        answers = ["yes" if held else "no" for held in (improves, significant)]
+        rows.append((name, *answers, ", ".join(below) or "none", verdict if found.finished else "not finished"))
+    if not rows:
+        return None
+    return Table(
+        name="decision",
+        title="Decision",
+        note=f"By the rule of docs/studies.md a variant is preferred to {baseline} if the interval of P(> {baseline}) "
+        f"lies above 0.5, p is below {SIGNIFICANT:g}, and no task's interval of the mean score lies below that of "
+        f"{baseline}. A study decides when all its trials have finished.",
+        columns=("variant", "interval above 0.5", f"p below {SIGNIFICANT:g}", "tasks below", "preferred"),
+        rows=tuple(rows),
+    )
+
+
 def _played(found: Results) -> Table:
     columns = ["variant", "switches", "updates"]
     for what in ("steps", "visits", "updates"):
-        columns += [f"{what} {task}" for task in found.tasks]
+        columns += [f"{what} {found.shown(task)}" for task in found.tasks]
     rows = []
     for name in found.variants:
         trials = found.of(name)
@@ -311,5 +357,5 @@ def _over_training(found: Results) -> Table | None:
         (name, *(value for measure in measures.values() for value in _by_task(found, name, measure)))
         for name in found.variants
     ]
-    columns = ("variant", *(f"{measure} {task}" for measure in measures for task in found.tasks))
+    columns = ("variant", *(f"{measure} {found.shown(task)}" for measure in measures for task in found.tasks))
     return Table(name="training", title="Over training", note=note, columns=columns, rows=tuple(rows))
