@@ -30,6 +30,7 @@ from switchmt_snn.export.provenance import provenance
 from switchmt_snn.export.recording import Recording, recorded_plays
 from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAgent, onnx_session, read_nir
 from switchmt_snn.export.runtimes.guarded import read_file
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.runs.evaluations import evaluation_name
 from switchmt_snn.runs.files import file_name, json_text, made, sha256, write_atomically
 from switchmt_snn.runs.folder import RunFolder
@@ -84,6 +85,7 @@ class ExportSettings:
     parity_decisions: int = 1000
 
 
+@as_when_started()
 def export(
     run: str | Path | None = None,
     settings: ExportSettings | None = None,
@@ -243,6 +245,7 @@ def _read_back(network: FoldedNetwork, files: dict[str, Path]) -> Exports:
     return Exports(network, decision, step, graphs or None, own, unrolled)
 
 
+@as_when_started()
 def evaluate_exported(
     runtime: str, run: str | Path | None = None, task: str | None = None, checkpoint: str = "last", **protocol: Any
 ) -> tuple[Evaluation, float]:

@@ -36,6 +36,7 @@ from switchmt_snn.export.report.sample import take_sample
 from switchmt_snn.export.report.verdict import silent_layers, verdict
 from switchmt_snn.export.selection import Selection
 from switchmt_snn.machine.progress import progress_of
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.runs.environment import command_line
 from switchmt_snn.runs.files import json_text, made, write_atomically, writing
 from switchmt_snn.runs.packing import open_run
@@ -64,6 +65,7 @@ class ProfileResult:
     frames: Frames
 
 
+@as_when_started()
 def profile(
     run: str | Path | None = None,
     decisions: int = 1000,
@@ -137,6 +139,7 @@ def profile(
     return _written(folder, profiles, selection.targets, facts, tasks, tuple(frames))
 
 
+@as_when_started()
 def profile_file(
     file: str | Path,
     observations: str | Path,

@@ -23,8 +23,10 @@ from switchmt_snn.export.npz import not_finite
 from switchmt_snn.export.runtimes.guarded import nir_tree, read_file, require_runnable
 from switchmt_snn.export.runtimes.nir_interpreter import Float, NirInterpreter
 from switchmt_snn.export.runtimes.onnx_walk import require_plain
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.spiking.encodings import encoding_class, make_encoding
 from switchmt_snn.spiking.layers import ReadoutNode
+from switchmt_snn.tasks.observations import raw_batch
 from switchmt_snn.tasks.suite import TaskSuite
 
 Observations = npt.NDArray[Any]
@@ -211,17 +213,18 @@ class OnnxAgent:
         return values
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]`` of a task (name or index); -inf where an action does not exist."""
+        """Q-values ``[B, A]``, of one observation ``[A]``; -inf where an action does not exist: as ``Agent.q_values``."""
         index = self.suite.index(task)
-        outputs = self.decide(observation, np.full(len(observation), index))
+        batch, single = raw_batch(self.suite, observation)
+        outputs = self.decide(batch, np.full(len(batch), index))
         if "q_values" not in outputs:
             raise ExportError(
                 f"the ONNX file gives {', '.join(outputs)!r:.80}, expected q_values; export the run again"
             )
         values: npt.NDArray[np.float32] = outputs["q_values"]
         valid_A = self.suite.valid_actions_KA[index]
-        require_numbers(values, len(observation), valid_A, "ONNX", self.suite.names[index])
-        return values
+        require_numbers(values, len(batch), valid_A, "ONNX", self.suite.names[index])
+        return values[0] if single else values
 
 
 class NirAgent:
@@ -253,17 +256,20 @@ class NirAgent:
         self._generator.manual_seed(seed)
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]`` of a task (name or index); -inf where an action does not exist."""
+        """Q-values ``[B, A]``, of one observation ``[A]``; -inf where an action does not exist: as ``Agent.q_values``."""
         index = self.suite.index(task)
-        encoded = encode(self.suite, self.config, observation, self._generator)
+        batch, single = raw_batch(self.suite, observation)
+        with as_when_started():
+            encoded = encode(self.suite, self.config, batch, self._generator)
         outputs, _ = self.interpreters[self.suite.names[index]].run(encoded)
         settings = self.config.network
         q_BA, valid_A = (
             ReadoutNode(settings.readout, settings.readout_beta)(outputs),
             self.suite.valid_actions_KA[index],
         )
-        require_numbers(q_BA, len(observation), valid_A, "NIR", self.suite.names[index])
-        return existing_only(q_BA, valid_A)
+        require_numbers(q_BA, len(batch), valid_A, "NIR", self.suite.names[index])
+        values = existing_only(q_BA, valid_A)
+        return values[0] if single else values
 
 
 class ComparedAgent:

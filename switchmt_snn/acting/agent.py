@@ -10,10 +10,12 @@ import numpy.typing as npt
 import torch
 
 from switchmt_snn.config import ExperimentConfig
-from switchmt_snn.errors import TaskError
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.spiking.encodings import encoding_class
-from switchmt_snn.spiking.network import QNetwork
+from switchmt_snn.spiking.network import ObservationSpec, QNetwork, build_network
 from switchmt_snn.tasks.as_trained import TaskAsTrained
+from switchmt_snn.tasks.observations import raw_batch
+from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
 
 
@@ -42,6 +44,12 @@ class Agent:
         """The same agent for another thread (snnTorch's neurons write into themselves, a generator moves on)."""
         return Agent(copy.deepcopy(self.network), self.suite, self.config, self.device, self.step)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle: to processes of one's own. The tasks and the network are made anew there, from the config."""
+        weights = {name: value.cpu() for name, value in self.network.state_dict().items()}
+        stored = self.config, self.network.observation, weights, self.device, self.step, self._generator.get_state()
+        return _unpickled, stored
+
     @property
     def draws(self) -> bool:
         """Whether a greedy decision draws random numbers: of a random encoding."""
@@ -51,45 +59,30 @@ class Agent:
         """Restart the random numbers of the ``rate`` encoding, the only randomness of a greedy decision."""
         self._generator.manual_seed(seed)
 
-    def q_values(self, observation: npt.NDArray[Any], task: str | int) -> npt.NDArray[np.float32]:
+    def q_values(self, observation: Any, task: str | int) -> npt.NDArray[np.float32]:
         """Q-values ``[A]`` of one stacked observation, or ``[B, A]`` of a batch; -inf where an action does not exist.
 
         Args:
-            observation: raw, ``suite.observation_shape`` (Atari: uint8 ``[4, 84, 84]``, oldest frame first) or a batch.
-                Without stacked frames also one image as its environment gives it: ``[H, W]`` or ``[H, W, c]``.
+            observation: raw, ``suite.observation_shape`` (Atari: uint8 ``[4, 84, 84]``, oldest frame first) or a batch;
+                an array, a tensor or a list. Without stacked frames also one image as its environment gives it:
+                ``[H, W]`` or ``[H, W, c]``.
             task: name or index.
 
         Raises:
-            TaskError: unknown task, or an observation of another shape.
+            TaskError: unknown task, an observation of another shape, or numbers that the task cannot have given.
         """
         index = self.suite.index(task)
-        expected = self.suite.observation_shape
-        observation = self._channels_first(observation)
-        batch = observation[None] if observation.shape == expected else observation
-        if batch.shape[1:] != expected:
-            raise TaskError(
-                f"the observation has shape {observation.shape}, expected {expected} or (batch, "
-                f"{', '.join(map(str, expected))}): stacked frames, channels first, raw values"
-            )
+        batch, single = raw_batch(self.suite, observation)
         self.network.eval()
-        with torch.inference_mode():
+        with as_when_started(), torch.inference_mode():
             q_BA = self.network(
                 torch.from_numpy(np.ascontiguousarray(batch)).to(self.device), index, generator=self._generator
             )
             q_BA = q_BA.masked_fill(self._invalid_KA[index], -torch.inf)
         values: npt.NDArray[np.float32] = q_BA.cpu().numpy()
-        return values[0] if observation.shape == expected else values
+        return values[0] if single else values
 
-    def _channels_first(self, observation: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """One image whose shape says that its channels are last, or left out, with its channels first."""
-        channels, *image = self.suite.observation_shape
-        if len(image) != 2 or self.suite.frame_stack != 1 or observation.shape == self.suite.observation_shape:
-            return observation
-        if channels == 1 and observation.shape == tuple(image):
-            return observation[None]
-        return np.moveaxis(observation, -1, 0) if observation.shape == (*image, channels) else observation
-
-    def act(self, observation: npt.NDArray[Any], task: str | int) -> Any:
+    def act(self, observation: Any, task: str | int) -> Any:
         """The greedy action (an int) for one observation, or ``[B]`` for a batch, as the environment takes it.
 
         That is the index of the largest Q-value (see ``q_values``), plus the ``start`` of the environment's
@@ -116,3 +109,19 @@ class Agent:
             TaskError: unknown task, or it cannot be made here.
         """
         return TaskAsTrained(self.suite, task)
+
+
+def _unpickled(
+    config: ExperimentConfig,
+    observation: ObservationSpec,
+    weights: dict[str, torch.Tensor],
+    device: torch.device,
+    step: int,
+    generator_state: torch.Tensor,
+) -> Agent:
+    with as_when_started():
+        network = build_network(config.network, observation, config.seed)
+        network.load_state_dict(weights)
+        agent = Agent(network, make_suite(config.tasks).at(step), config, device, step)
+        agent._generator.set_state(generator_state)
+        return agent

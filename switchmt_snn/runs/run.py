@@ -21,6 +21,7 @@ from switchmt_snn.learning.shared_learner import SharedLearner
 from switchmt_snn.learning.switching import Criterion
 from switchmt_snn.learning.training import Training
 from switchmt_snn.machine.devices import keep_freed_memory
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.replay.ring import Batch
 from switchmt_snn.runs.best import BestWeights
 from switchmt_snn.runs.changes import note_changes
@@ -93,7 +94,9 @@ def train(
         suite: a task suite of your own; it replaces ``tasks.suite``, likewise (docs/extending.md, Task and suite).
         trust: let modules that ``run`` names be imported although this user did not make it (SECURITY.md).
 
-    Under ``torchrun`` the first process does all this, and every update is divided among all processes.
+    PyTorch's global settings (default dtype and device, autocast, threads, ...) have no effect on a run, and are
+    afterwards as before. Under ``torchrun`` the first process does all this, and every update is divided among all
+    processes.
 
     Raises:
         SwitchMTError: wrong use (``exit_code`` 2), or a run that failed (``exit_code`` 1).
@@ -107,14 +110,15 @@ def train(
         >>> result.status, result.step
         ('finished', 300)
     """
-    group = join_processes()
-    try:
-        if group is not None and group.rank > 0:
-            return _serve(group)
-        return _train(config, run, observers, group, policy, suite, trust)
-    finally:
-        if group is not None:
-            group.leave()
+    with as_when_started():
+        group = join_processes()
+        try:
+            if group is not None and group.rank > 0:
+                return _serve(group)
+            return _train(config, run, observers, group, policy, suite, trust)
+        finally:
+            if group is not None:
+                group.leave()
 
 
 def _train(

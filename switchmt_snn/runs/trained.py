@@ -13,6 +13,7 @@ from switchmt_snn.acting.agent import Agent
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, evaluate_agent
 from switchmt_snn.learning.parts import observation_spec
 from switchmt_snn.machine.devices import select_device
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.runs.checkpoint import fitting_weights
 from switchmt_snn.runs.fresh_statistics import with_fresh_statistics
 from switchmt_snn.runs.packing import open_run
@@ -58,13 +59,15 @@ def load_agent(
     folder = open_run(run, trust=trust)
     config = folder.config()
     suite = make_suite(config.tasks)
-    step, weights = folder.checkpoints().load_model(checkpoint)
-    network = build_network(config.network, observation_spec(suite), config.seed)
-    with fitting_weights():
-        network.load_state_dict(weights)
-    return Agent(network, suite.at(step), config, select_device(device), step)
+    with as_when_started():
+        step, weights = folder.checkpoints().load_model(checkpoint)
+        network = build_network(config.network, observation_spec(suite), config.seed)
+        with fitting_weights():
+            network.load_state_dict(weights)
+        return Agent(network, suite.at(step), config, select_device(device), step)
 
 
+@as_when_started()
 def evaluate(
     run: str | Path | None = None,
     task: str | None = None,

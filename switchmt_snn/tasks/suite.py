@@ -175,8 +175,8 @@ class TaskSuite:
             if task not in self.names:
                 raise TaskError(f"unknown task {task!r}{did_you_mean(task, self.names)}")
             return self.names.index(task)
-        if not 0 <= task < len(self.names):
-            raise TaskError(f"task is {task}, expected a name or an index from 0 to {len(self.names) - 1}")
+        if not isinstance(task, (int, np.integer)) or not 0 <= task < len(self.names):
+            raise TaskError(f"task is {task!r}, expected a name or an index from 0 to {len(self.names) - 1}")
         return int(task)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import pickle  # noqa: TID251 - what users' process pools do
 import threading
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,6 +153,72 @@ def test_agent_acts_on_one_observation_and_on_batches() -> None:
         agent.q_values(batch[0], 2)
     with pytest.raises(TaskError, match="has shape"):
         agent.act(batch[0, 0], "asterix")
+
+
+def gym_agent(suite_fields: dict[str, Any]) -> Agent:
+    suite = replace(vector_suite(lambda task, n: CountingEnvironment(task, n, 9), 4), **suite_fields)
+    return small_agent(suite)
+
+
+def test_observations_of_any_container_and_type_are_the_same_numbers() -> None:
+    agent = gym_agent({})
+    x = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
+    expected = agent.q_values(x, 0)
+    tensor = torch.tensor(x, requires_grad=True)
+    for given in (x.tolist(), tensor, tensor.double(), x.astype(np.float64), x.astype(">f4"), x[:, ::-1][:, ::-1]):
+        assert np.array_equal(agent.q_values(given, 0), expected)
+    assert np.array_equal(agent.q_values(tensor[0], 0), expected[0])
+    assert np.array_equal(agent.q_values([1, 2, 3, 4], 0), agent.q_values(np.asarray([1, 2, 3, 4], np.float32), 0))
+    assert agent.q_values(torch.zeros(2, 4, dtype=torch.bfloat16), 0).shape == expected[:2].shape
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([0.0, np.nan, 0.0, 0.0], "has values from nan to nan, expected finite numbers"),
+        (np.asarray([0.0, 1e300, 0.0, 0.0]), r"has values from 0 to 1e\+300, expected finite numbers \(float32\)"),
+        (np.asarray(["a"] * 4), "is of type <U1, expected raw numbers"),
+        (np.asarray([1j] * 4), "is of type complex128, expected raw numbers"),
+        (None, r"has shape \(\)"),
+        ([[1.0], [1.0, 2.0]], r"has shape \(\)"),
+    ],
+)
+def test_what_are_no_observations_is_refused(given: Any, message: str) -> None:
+    with pytest.raises(TaskError, match=message):
+        gym_agent({}).act(given, 0)
+
+
+@pytest.mark.parametrize("task", [None, 0.0, 2, -1])
+def test_what_are_no_tasks_is_refused(task: Any) -> None:
+    with pytest.raises(TaskError, match=f"task is {task}, expected a name or an index from 0 to 1"):
+        gym_agent({}).act(np.zeros(4), task)
+
+
+def test_images_are_taken_as_raw_bytes_only() -> None:
+    """Floats in [0, 1] would be scaled a second time, in silence."""
+    fields = {"frame_dtype": np.uint8, "scale": 1 / 255, "in_unit_range": True}
+    agent = gym_agent(fields)
+    pixels = np.asarray([[0, 17, 130, 255]], np.uint8)
+    expected = agent.q_values(pixels, 0)
+    for given in (pixels.astype(np.int64), pixels.tolist(), torch.tensor(pixels)):
+        assert np.array_equal(agent.q_values(given, 0), expected)
+    with pytest.raises(TaskError, match="is of type float32, expected raw bytes, as the environment gives them"):
+        agent.q_values(pixels / np.float32(255), 0)
+    with pytest.raises(TaskError, match="has values from 0 to 256, expected raw ones from 0 to 255"):
+        agent.q_values([0, 1, 2, 256], 0)
+    with pytest.raises(TaskError, match="has values from 0 to 255, expected raw ones from 0 to 1"):
+        gym_agent(fields | {"scale": 1.0}).q_values(pixels, 0)
+
+
+def test_a_pickled_agent_decides_alike() -> None:
+    agent = minatar_agent(encoding="rate")
+    x = np.random.default_rng(0).integers(0, 2, (3, *agent.suite.observation_shape)).astype(np.uint8)
+    agent.q_values(x, 0)
+    other = pickle.loads(pickle.dumps(agent))  # noqa: S301
+    assert other.step == 12
+    assert other.environment(0).reset(seed=1)[0].shape == x[0].shape
+    for _ in range(2):
+        assert np.array_equal(other.q_values(x, 0), agent.q_values(x, 0))
 
 
 @pytest.mark.slow

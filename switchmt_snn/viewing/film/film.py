@@ -17,6 +17,7 @@ from switchmt_snn.acting.episodes import EpisodeScore
 from switchmt_snn.acting.evaluation import EvaluationProtocol
 from switchmt_snn.acting.watching import WatchedAgent, gains_of
 from switchmt_snn.errors import ConfigError
+from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.runs.signals import stop_requests
 from switchmt_snn.tasks.registry import suite_of
 from switchmt_snn.viewing.film import panels
@@ -153,6 +154,7 @@ class Lane:
         panels.draw_trace(canvas, layout.trace, seen, self.axis, layout.compact)
 
 
+@as_when_started()
 def make_film(
     agent: WatchedAgent,
     protocol: EvaluationProtocol,
