@@ -213,7 +213,7 @@ class OnnxAgent:
         return values
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]``, of one observation ``[A]``; -inf where an action does not exist: as ``Agent.q_values``."""
+        """As ``Agent.q_values``: ``[B, A]``, of one observation ``[A]``; -inf where an action does not exist."""
         index = self.suite.index(task)
         batch, single = raw_batch(self.suite, observation)
         outputs = self.decide(batch, np.full(len(batch), index))
@@ -256,7 +256,7 @@ class NirAgent:
         self._generator.manual_seed(seed)
 
     def q_values(self, observation: Observations, task: str | int) -> npt.NDArray[np.float32]:
-        """Q-values ``[B, A]``, of one observation ``[A]``; -inf where an action does not exist: as ``Agent.q_values``."""
+        """As ``Agent.q_values``: ``[B, A]``, of one observation ``[A]``; -inf where an action does not exist."""
         index = self.suite.index(task)
         batch, single = raw_batch(self.suite, observation)
         with as_when_started():
