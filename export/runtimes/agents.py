@@ -48,7 +48,8 @@ def onnx_session(model: Path | bytes, threads: int = 1) -> onnxruntime.Inference
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
-        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        # Its fallback is to the same provider, and prints.
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
         # Names and metadata that are no text fail when they are asked for.
         _ = (
             session.get_modelmeta().custom_metadata_map,

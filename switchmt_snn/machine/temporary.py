@@ -38,7 +38,7 @@ def temporary_beside(path: Path) -> Path:
 
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """A new folder beside ``path``; removed at the end, with what is still in it."""
+    """A new folder that will take the place of ``path``; removed at the end, if it was not renamed."""
     folder = temporary_beside(path)
     folder.mkdir()
     try:

@@ -129,8 +129,7 @@ def pack(run: str | Path | None, out: str | Path, checkpoint: str = "last") -> P
     with writing(out, "--out", whole=True):
         out.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(out) as unfinished:
-            packed = RunFolder(unfinished / out.name)
-            packed.path.mkdir()
+            packed = RunFolder(unfinished)
             for name in _FILES:
                 if (folder.path / name).is_file():
                     (packed.path / name).parent.mkdir(exist_ok=True)
@@ -158,9 +157,9 @@ def _whole_copy(source: Path, target: Path) -> None:
     with writing(target, whole=True):
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target) as unfinished:
-            shutil.copytree(source, unfinished / target.name, copy_function=shutil.copyfile)
+            shutil.copytree(source, unfinished, copy_function=shutil.copyfile, dirs_exist_ok=True)
             try:
-                (unfinished / target.name).rename(target)
+                unfinished.rename(target)
             except OSError:
                 if not RunFolder(target).is_run:
                     raise

@@ -14,7 +14,7 @@ import shutil
 import signal
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,12 +91,13 @@ def outcome(name: str, folder: Path, content: bytes, number: int = 0) -> str:
     """What a format's reader does with a mutant: ``taken``, or the line by which it refuses.
 
     Raises:
-        AssertionError: the line is not one printable line, or the memory grew too far.
+        AssertionError: the line is not one printable line, something was printed, or the memory grew too far.
         TimeoutError: it took too long.
     """
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     line = "taken"
-    with _cpu_limit(MOST_CPU_S), warnings.catch_warnings():
+    said = io.StringIO()
+    with _cpu_limit(MOST_CPU_S), warnings.catch_warnings(), redirect_stdout(said):
         warnings.simplefilter("ignore")
         try:
             FORMATS[name].read(folder, content, number)
@@ -104,6 +105,7 @@ def outcome(name: str, folder: Path, content: bytes, number: int = 0) -> str:
             refusal: SwitchMTError | None = error
         else:
             refusal = None
+    assert said.getvalue() == "", f"a library printed {said.getvalue()!r:.200}"
     if refusal is not None:
         line = str(refusal).replace(str(folder), "FOLDER")
         assert refusal.exit_code == 2, line
