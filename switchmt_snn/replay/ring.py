@@ -313,7 +313,7 @@ class FrameReplay:
         require_saved(state, ("written", "oldest", "transitions_added", *arrays), owner)
         lanes = np.shape(self._written)
         whole = np.shape(state["written"]) == lanes and np.asarray(state["written"]).dtype.kind == "i"
-        held = int(np.minimum(state["written"], self.slots).sum()) if whole else -1
+        held = int(np.minimum(np.asarray(state["written"], np.int64), self.slots).sum()) if whole else -1
         expected = {"written": lanes, "oldest": lanes, **dict.fromkeys(arrays, (held,))}
         dtypes = {"written": self._written.dtype, "oldest": self._oldest.dtype}
         dtypes |= {name: array.dtype for name, array in arrays.items()}  # older versions had shorter ones
@@ -331,7 +331,8 @@ class FrameReplay:
 
     def _unsound(self, state: dict[str, Any]) -> str:
         """What of a state of the right shapes breaks the invariants of ``check_valid``; empty if nothing does."""
-        written, oldest, added = state["written"], state["oldest"], state["transitions_added"]
+        written, oldest = (np.asarray(state[name], np.int64) for name in ("written", "oldest"))
+        added = state["transitions_added"]
         if not isinstance(added, int) or not 0 <= added < _MOST_STEPS:
             return "transitions_added out of range"
         if (oldest < 0).any() or (oldest > written).any() or (written - oldest > self.slots).any():
