@@ -136,11 +136,13 @@ def _run(folder: Path) -> list[str]:
         protocol = str(EvaluationProtocol.from_dict(stored["protocol"]))
         scores = {row["task"]: row for row in stored["tasks"] if row["policy"] == "agent"}
         cells = [f"{scores[game]['mean']:.1f} ± {scores[game]['standard_error']:.1f}" for game in games]
-        lines.append(_row([f"after {stored['step']:,} steps", *cells]))
+        played = f"{stored['protocol']['episodes']} episodes, epsilon {stored['protocol']['epsilon']:g}"
+        lines.append(_row([f"after {stored['step']:,} steps ({played})", *cells]))
     for published in PUBLISHED_SCORES:
         lines.append(_row([published.policy, *(f"{published.scores[game]:g}" for game in games)]))
     if protocol:
-        lines += ["", f"Ours: mean ± standard error; {protocol}."]
+        conditions = ", ".join(protocol.split(", ")[2:])  # after episodes and epsilon, which stand in the rows
+        lines += ["", f"Ours: mean ± standard error; {conditions}."]
     return [*lines, *_statistics(folder)]
 
 

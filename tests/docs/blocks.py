@@ -9,15 +9,23 @@ The conventions are visible to readers:
 - a command that ends with ``# tested with OPTIONS`` gets the options, in place of its own; a Python line that ends with
   ``# tested with NUMBER`` gets the number in place of its last one.
 - a block whose first line is ``# not tested: REASON`` is not run; the test lists it.
+
+Commands and scripts run in processes that are forked from one that has imported PyTorch, which takes longer than most
+of them do; lines that need a shell run in one.
 """
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 import os
 import re
+import runpy
+import shlex
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +33,8 @@ ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"# ([\w./-]+\.(?:py|yaml))")
 _NOT_TESTED = re.compile(r"# not tested: (.+)")
+_SHELL = re.compile(r"[|&;<>$*`]")
+_IMPORTED = ["torch._dynamo", "switchmt_snn.runs.run", "switchmt_snn.export.export_run", "switchmt_snn.cli.entry"]
 _LINKED = ("examples", "configs", "results", "benchmarks", "tests")
 
 
@@ -99,17 +109,60 @@ class Reader:
         if block.file_name is not None:
             (self.folder / block.file_name).write_text(text)
             if block.file_name.startswith("train_"):
-                self._run([sys.executable, block.file_name], block)
+                self._fork([block.file_name], block)
         elif block.language == "bash":
             for line in text.replace("\\\n", " ").splitlines():
-                self._run(["bash", "-euo", "pipefail", "-c", line], block)
+                words = shlex.split(line, comments=True)
+                if words[:1] == ["switchmt-snn"] and not _SHELL.search(line):
+                    self._fork(words, block)
+                else:
+                    self._shell(line, block)
         elif block.language == "python":
-            script = self.folder / "snippet.py"
-            script.write_text(text)
-            self._run([sys.executable, str(script)], block)
+            (self.folder / "snippet.py").write_text(text)
+            self._fork(["snippet.py"], block)
         else:
             raise AssertionError(f"{block}: a {block.language or 'plain'} block that is no file and no command")
 
-    def _run(self, command: list[str], block: Block) -> None:
+    def _shell(self, line: str, block: Block) -> None:
+        command = ["bash", "-euo", "pipefail", "-c", line]
         done = subprocess.run(command, cwd=self.folder, env=self.environment, capture_output=True, text=True)
-        assert done.returncode == 0, f"{block}\n{command[-1]}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+        assert done.returncode == 0, f"{block}\n{line}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+
+    def _fork(self, words: list[str], block: Block) -> None:
+        printed = self.folder / ".printed"
+        with _environment({"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}):  # of the process that imports
+            context = multiprocessing.get_context("forkserver")
+            context.set_forkserver_preload(_IMPORTED)
+            process = context.Process(target=_run_here, args=(words, self.folder, self.environment, printed))
+            process.start()
+        process.join()
+        assert process.exitcode == 0, f"{block}\n{shlex.join(words)}\n{printed.read_text()[-6000:]}"
+
+
+@contextlib.contextmanager
+def _environment(changes: dict[str, str]) -> Iterator[None]:
+    before = dict(os.environ)
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+def _run_here(words: list[str], folder: Path, environment: dict[str, str], printed: Path) -> None:
+    """What a process of its own does with a command or a script: its folder, environment and output are set here."""
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    with printed.open("wb") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+    sys.argv = list(words)
+    if words[0].endswith(".py"):
+        sys.path.insert(0, str(folder))
+        runpy.run_path(words[0], run_name="__main__")
+    else:
+        from switchmt_snn.cli import run_program
+
+        run_program()
