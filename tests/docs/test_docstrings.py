@@ -104,7 +104,8 @@ def test_every_example_of_a_docstring_is_in_the_list() -> None:
         for path in (ROOT / folder).rglob("*.py")
         if ">>> " in path.read_text()
     }
-    listed = {Path(inspect.getsourcefile(part)).resolve().relative_to(ROOT).as_posix() for part in EXAMPLES}
+    files = [inspect.getsourcefile(inspect.unwrap(part)) for part in EXAMPLES]
+    listed = {Path(file).resolve().relative_to(ROOT).as_posix() for file in files}
     assert with_examples == listed
 
 
