@@ -13,7 +13,7 @@ from switchmt_snn.config import ExperimentConfig, clips_rewards
 from switchmt_snn.config.plugins import is_plugin
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import rounding
+from switchmt_snn.tasks.gym_spaces import dim_pixels, rounding
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.suite import TaskSuite
 
@@ -32,8 +32,8 @@ def warnings_unless_refused() -> Iterator[None]:
     """Show the warnings of a block (Gymnasium's checker) after it, and none if it raises: a refusal is one line."""
     with warnings.catch_warnings(record=True) as caught:
         yield
-    for seen in caught:
-        warnings.warn_explicit(seen.message, seen.category, seen.filename, seen.lineno)
+    for shown in dict.fromkeys((str(seen.message), seen.category, seen.filename, seen.lineno) for seen in caught):
+        warnings.warn_explicit(*shown)
 
 
 def check_before_training(config: ExperimentConfig, tasks: TaskSuite) -> tuple[str, ...]:
@@ -65,10 +65,9 @@ def check_before_training(config: ExperimentConfig, tasks: TaskSuite) -> tuple[s
                 )
             seen_values = max(float(np.abs(seen[0]).max()) for seen in first)
             made = make_environment(name, config.tasks.wrappers)
-            rounded = rounding(made.observation_space, seen_values)
+            texts = rounding(made.observation_space, 0.0), dim_pixels(tasks.scale, seen_values)
             made.close()
-            if rounded is not None:
-                notes.append(f"warning: task {name!r}: {rounded}")
+            notes += [f"warning: task {name!r}: {text}" for text in texts if text is not None]
             step = differs_from(first, second)
             if step is not None:
                 notes.append(

@@ -121,7 +121,8 @@ class CheckedEnvironment:
 
     def close(self) -> None:
         """Free the copies."""
-        self._environment.close()
+        with task_code(self._name, "close"):
+            self._environment.close()
 
     def _require_frames(self, frames: Frames, count: int) -> None:
         if not isinstance(frames, np.ndarray):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.errors import MissingExtraError, TaskError, shown
+from switchmt_snn.tasks.gym_spaces import LARGEST_WHOLE, RoundedObservation
 from switchmt_snn.tasks.randomness import OwnGenerators
 from switchmt_snn.tasks.suite import Frames, Picture, VectorStep
 
@@ -131,6 +133,14 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         placed = np.zeros(self._shape, self._dtype)
         with np.errstate(over="ignore"):  # what is no float32 becomes infinite, and is refused as such
             placed[tuple(slice(0, side) for side in frame.shape)] = frame
+        if frame.dtype == np.float64 and LARGEST_WHOLE < np.abs(placed).max() < np.inf:
+            # The same text each time: Python and our output show it once.
+            warnings.warn(
+                f"task {self._name!r} gives float64 observations above {LARGEST_WHOLE:,}; networks take float32, which "
+                "rounds whole numbers there; scale or split them in a wrapper (tasks.wrappers)",
+                RoundedObservation,
+                stacklevel=1,
+            )
         return placed
 
     def _one_number(self, reward: Any) -> float:

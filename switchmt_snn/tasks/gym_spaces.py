@@ -16,6 +16,9 @@ ImageLayout = Literal["by_shape", "channels_last", "channels_first"]
 FEW_CHANNELS = 4
 """Most channels that an image is expected to have where only its shape tells which axis they are."""
 
+DIM = 32
+"""Pixels of 255 up to which an image is called dim."""
+
 LARGEST_WHOLE = 2**24
 """float32 holds every whole number up to this one; of larger ones at best every second."""
 
@@ -118,6 +121,25 @@ def rounding(space: gymnasium.Space[Any], largest_seen: float) -> str | None:
     return (
         f"its observation_space {source}; networks take float32, which rounds whole numbers above {LARGEST_WHOLE:,}; "
         "declare the bounds that they have, or scale or split them in a wrapper (tasks.wrappers)"
+    )
+
+
+class RoundedObservation(UserWarning):
+    """Observations hold numbers that float32 rounds to others."""
+
+
+def dim_pixels(scale: float, high: float) -> str | None:
+    """What a user should know where an image has values that, scaled, hardly reach the network.
+
+    Examples:
+        >>> dim_pixels(1 / 255, 1)
+        'pixels up to 1 of 255: the network sees 0.0039 at most; spread them in a wrapper (tasks.wrappers)'
+    """
+    if scale == 1.0 or high > DIM:
+        return None
+    return (
+        f"pixels up to {high:g} of 255: the network sees {high * scale:.2g} at most; spread them in a wrapper "
+        "(tasks.wrappers)"
     )
 
 

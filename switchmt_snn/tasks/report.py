@@ -18,7 +18,7 @@ from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.check import FROM_ITS_SEED, differs_from, journal, one_episode
 from switchmt_snn.tasks.gym_copies import GymCopies
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import frame_layout, rounding
+from switchmt_snn.tasks.gym_spaces import RoundedObservation, dim_pixels, frame_layout, rounding
 from switchmt_snn.tasks.play import Play, episode_seed
 from switchmt_snn.tasks.registry import make_suite, suite_of
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite
@@ -153,7 +153,7 @@ def check_env(
         asked = _Asked(steps, seconds, seed, say, clock)
         reports = [_report(config, tasks, task, asked) for task in range(len(names))]
     # A DeprecationWarning is for a library's authors; Python, too, hides it from those who run the library.
-    told = (warning for warning in caught if not issubclass(warning.category, DeprecationWarning))
+    told = (warning for warning in caught if not issubclass(warning.category, (DeprecationWarning, RoundedObservation)))
     heard = tuple(dict.fromkeys(_plain(str(warning.message)) for warning in told))
     if heard and len(reports) == 1:
         reports[0] = replace(reports[0], notes=(*reports[0].notes, *heard))
@@ -338,11 +338,9 @@ def _notes_on_values(report: EnvironmentReport, space: Box | None) -> list[str]:
                 f"observations from {low:g} to {high:g} leave the space's bounds from {lowest:g} to {highest:g}"
             )
     rounded = None if space is None else rounding(space, max(-low, high))
-    if report.scale < 1 and high <= 32:
-        notes.append(
-            f"pixels up to {high:g} of 255: the network sees {high * report.scale:.2g} at most; spread them in a "
-            "wrapper (tasks.wrappers)"
-        )
+    dim = dim_pixels(report.scale, high)
+    if dim is not None:
+        notes.append(dim)
     if rounded is not None:
         notes.append(rounded)
     elif report.layout == "vector" and max(-low, high) > 100:

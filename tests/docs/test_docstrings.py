@@ -37,7 +37,7 @@ from switchmt_snn.study.statistics import (
 )
 from switchmt_snn.study.timing import makespan
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import with_wrapper
+from switchmt_snn.tasks.gym_spaces import dim_pixels, with_wrapper
 from switchmt_snn.tasks.report import check_env
 from switchmt_snn.viewing.report.curves import running_means, thinned
 from switchmt_snn.viewing.report.page import write_report
@@ -68,6 +68,7 @@ EXAMPLES: tuple[Any, ...] = (
     best_split,
     json_text,
     make_environment,
+    dim_pixels,
     with_wrapper,
     check_env,
     printable,

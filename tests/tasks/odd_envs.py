@@ -77,6 +77,18 @@ class OneNumber(Plain):
         return later(super().observe(), 3, self)
 
 
+class GrowingDouble(Plain):
+    observation_space = Box(-np.inf, np.inf, (4,), np.float64)
+
+    def observe(self) -> Any:
+        return later(np.zeros(4), np.full(4, 2.0**24 + 3), self)
+
+
+class CannotClose(Plain):
+    def close(self) -> None:
+        raise RuntimeError("still open")
+
+
 class ResetWithoutInfo(Plain):
     """As environments before Gymnasium; two numbers, so that they could be unpacked."""
 

@@ -16,7 +16,7 @@ import torch
 from switchmt_snn.config import TasksConfig
 from switchmt_snn.errors import ConfigError, TaskError
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import frame_layout, rounding
+from switchmt_snn.tasks.gym_spaces import RoundedObservation, frame_layout, rounding
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
@@ -102,6 +102,22 @@ def test_a_reset_without_info_is_named() -> None:
 )
 def test_whole_numbers_that_float32_rounds_are_noted(dtype: type, high: float, seen: float, noted: bool) -> None:
     assert (rounding(gymnasium.spaces.Box(0, high, (2,), dtype), seen) is not None) == noted
+
+
+@pytest.mark.filterwarnings("ignore:.*obs:UserWarning")  # as above
+def test_large_float64_numbers_are_told_when_they_first_come() -> None:
+    play = begun(suite_of("GrowingDouble"))
+    for _ in range(25):
+        play.step(np.asarray([0]))
+    with pytest.warns(RoundedObservation, match="gives float64 observations above 16,777,216; networks take float32"):
+        play.step(np.asarray([0]))
+    assert float(play.observations[0, 0]) == 2**24 + 4  # not 2**24 + 3
+
+
+@pytest.mark.filterwarnings("ignore")  # as above
+def test_an_environment_that_cannot_be_closed_is_named() -> None:
+    with pytest.raises(TaskError, match=r"fails in close \(RuntimeError: still open at odd_envs.py, line \d+\)"):
+        suite_of("CannotClose")
 
 
 @pytest.mark.filterwarnings("ignore")  # as above

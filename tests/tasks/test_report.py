@@ -255,6 +255,12 @@ def test_a_run_says_before_it_starts_that_float32_rounds_observations() -> None:
     )
 
 
+def test_a_run_says_before_it_starts_that_its_images_are_dim() -> None:
+    config = from_dict({"tasks": {"suite": "gym", "names": [f"{MODULE}:FaintImage-v0"]}})
+    (note,) = check_before_training(config, make_suite(config.tasks))
+    assert "pixels up to 10 of 255: the network sees 0.039 at most" in note
+
+
 @pytest.mark.slow
 def test_a_run_says_before_it_starts_that_it_clips_rewards() -> None:
     """Clipping is Atari's custom: elsewhere it can change what is best."""
