@@ -128,10 +128,27 @@ def _decided(folder: Path) -> list[str]:
 
 
 def _study(folder: Path) -> list[str]:
-    """A study's tables, as they stand in its folder."""
+    """A study's tables, as they stand in its folder, and what it took."""
     made = (folder / "tables.md").read_text().splitlines()
-    lines = [f"## Study `{folder.name}`", ""]
+    lines = [f"## Study `{folder.name}`", "", *STUDIES[folder.name].strip().splitlines(), ""]
     lines += [line.replace("## ", "### ") for line in made if not line.startswith("# ")]
+    with (folder / "trials.csv").open() as file:
+        finished = {row["trial"] for row in csv.DictReader(file)}
+    seconds: dict[str, float] = {}
+    for line in (folder / "attempts.jsonl").read_text().splitlines():
+        attempt = json.loads(line)
+        seconds[attempt["trial"]] = seconds.get(attempt["trial"], 0.0) + attempt["seconds"]
+    taken = sorted(seconds[trial] / 60 for trial in finished)
+    machine = json.loads((folder / "environment.json").read_text())
+    stored = f"[results/studies/{folder.name}](../results/studies/{folder.name})"
+    lines += [
+        "",
+        f"`switchmt-snn study {folder.name}`: {statistics.median(taken):.1f} minutes per trial (median; {taken[0]:.1f} "
+        f"to {taken[-1]:.1f}) on one core of a machine that also did other work ({machine['processor']}, "
+        f"{machine['cores']} cores). {stored} has the numbers as CSV, and in `trials.tar.xz` config, logs and "
+        f"evaluations of every trial. Unpacked into `runs/studies/{folder.name}`, beside `trials.json`, the same "
+        "command goes on from there.",
+    ]
     return lines
 
 
@@ -182,6 +199,14 @@ whatever it says. Where it ended a visit, it did so at the first episode end at 
 the change was below its threshold. So it measured how long five episodes are, not whether learning had ended: games
 with short episodes are left early.
 """
+
+STUDIES = {
+    "unequal_tasks": """
+An easy, a medium and a hard-to-start task, episodes of 10 to 500 steps, and CartPole's left and right swapped after
+half of the steps ([the study](../configs/studies/unequal_tasks.yaml)).
+""",
+}
+"""What a reader must know of a study."""
 
 CLAIM = """
 ## The paper's claim

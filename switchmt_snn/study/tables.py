@@ -16,6 +16,7 @@ from switchmt_snn.drawing.numbers import digits
 from switchmt_snn.study import statistics
 from switchmt_snn.study.grid import Study
 from switchmt_snn.study.results import TaskResult, TrialResult
+from switchmt_snn.viewing.names import shown_task
 
 SIGNIFICANT = 0.05
 """Of the decision rule: p after Holm's correction is below it (docs/studies.md)."""
@@ -86,10 +87,8 @@ class Results:
         self.tasks = tuple(dict.fromkeys(row.task for one in results for row in one.tasks))
 
     def shown(self, task: str) -> str:
-        """A task's name in a table: without its module, where that still tells it from the others."""
-        short = [name.rsplit(":", 1)[-1] for name in self.tasks]
-        own = task.rsplit(":", 1)[-1]
-        return own if short.count(own) == 1 else task
+        """A task's name in a table."""
+        return shown_task(task, self.tasks)
 
     @property
     def finished(self) -> bool:

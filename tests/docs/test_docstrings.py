@@ -39,6 +39,7 @@ from switchmt_snn.study.timing import makespan
 from switchmt_snn.tasks.gym_make import make_environment
 from switchmt_snn.tasks.gym_spaces import dim_pixels, with_wrapper
 from switchmt_snn.tasks.report import check_env
+from switchmt_snn.viewing.names import shown_task
 from switchmt_snn.viewing.report.curves import running_means, thinned
 from switchmt_snn.viewing.report.page import write_report
 
@@ -52,6 +53,7 @@ EXAMPLES: tuple[Any, ...] = (
     bytes_of,
     duration,
     running_means,
+    shown_task,
     thinned,
     write_report,
     load_study,

@@ -10,6 +10,7 @@ import numpy as np
 
 from switchmt_snn.config import differences
 from switchmt_snn.drawing.chart import Chart, Reference, Series
+from switchmt_snn.viewing.names import shown_task
 from switchmt_snn.viewing.progress import RETURN_WINDOW_EPISODES
 from switchmt_snn.viewing.report.curves import on_grid, running_means
 from switchmt_snn.viewing.report.figures import STEPS
@@ -89,7 +90,7 @@ def comparison_figures(groups: Sequence[Group]) -> list[Chart]:
             charts.append(
                 Chart(
                     name=f"comparison_{number}",
-                    title=f"Raw return in {task}",
+                    title=f"Raw return in {shown_task(task, all_tasks(groups))}",
                     x_label=STEPS,
                     series=tuple(series),
                     references=_random(groups, task),

@@ -9,6 +9,7 @@ from switchmt_snn.config import METHOD_TRAITS
 from switchmt_snn.drawing.chart import Chart, Reference, Series
 from switchmt_snn.learning.events import LayerHealth, Measured
 from switchmt_snn.learning.measuring import HEALTH_BATCH
+from switchmt_snn.viewing.names import shown_task
 from switchmt_snn.viewing.progress import RETURN_WINDOW_EPISODES
 from switchmt_snn.viewing.report.curves import (
     HIGH_PERCENT,
@@ -63,7 +64,7 @@ def _learning_curve(run: Sources, task: int) -> Chart:
         series.append(Series("evaluation (mean)", x, y, "marks", colour=task + 1))
     return Chart(
         name=f"learning_{task + 1}",
-        title=f"Raw return in {name}",
+        title=f"Raw return in {shown_task(name, run.tasks)}",
         x_label=STEPS,
         series=tuple(one for one in series if one.x),
         references=tuple(_references(run, name)),

@@ -13,6 +13,7 @@ from switchmt_snn.drawing.chart import Chart, Series, Span, Timeline
 from switchmt_snn.drawing.numbers import digits
 from switchmt_snn.learning.switching.criterion import Deciding
 from switchmt_snn.runs.history import Decision
+from switchmt_snn.viewing.names import shown_task
 from switchmt_snn.viewing.report.curves import thinned
 from switchmt_snn.viewing.report.figures import STEPS
 from switchmt_snn.viewing.report.sources import Sources
@@ -84,7 +85,8 @@ def _timeline(run: Sources) -> Timeline:
             f"{len(stays):,} visits; the darker, the larger the task's share of a stretch of {end / STRETCHES:,.0f} "
             "steps."
         )
-    return Timeline("switching", "Which task was played", STEPS, run.tasks, tuple(spans), end, note)
+    rows = tuple(shown_task(task, run.tasks) for task in run.tasks)
+    return Timeline("switching", "Which task was played", STEPS, rows, tuple(spans), end, note)
 
 
 def _told(run: Sources, visit: Visit) -> str:
