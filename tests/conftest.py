@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,17 @@ from switchmt_snn.runs.plan import decide
 from switchmt_snn.tasks.suite import TaskEnvironment, TaskSuite, VectorStep
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _own_key(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A key of the tests' own, also for the fixtures of whole files, which are made before those of a test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / "state"))
+        yield
+
+
 @pytest.fixture(autouse=True)
-def _own_trust(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A key of the tests' own, and no module that an earlier test had refused or trusted."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / "state"))
+def _own_trust(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No module that an earlier test had refused or trusted."""
     monkeypatch.setattr(trust, "known", trust.Known())
 
 

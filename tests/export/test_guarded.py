@@ -257,7 +257,7 @@ def test_a_model_is_tried_in_a_child_before_it_is_opened_here(tmp_path: Path) ->
     ("change", "reason"),
     [
         ("name", "the ONNX file gives 'others', expected q_values"),
-        ("shape", r"Q-values of type float32 and shape \(3, 2\) in"),
+        ("shape", r"Q-values of type uint8 and shape \(3, 6, 10, 10\) in"),
         ("step", "training_step is 'x', expected a whole number"),
         ("input", "the ONNX file cannot decide"),
     ],
@@ -269,12 +269,15 @@ def test_an_onnx_file_of_another_network(change: str, reason: str) -> None:
     made.graph.node[0].input[0] = "observation"
     made.graph.node[0].output[0] = made.graph.output[0].name = "others" if change == "name" else "q_values"
     made.metadata_props.add(key="training_step", value="x" if change == "step" else "3")
+    for value in (made.graph.input[0], made.graph.output[0]):
+        value.type.tensor_type.ClearField("shape")
+        if change != "input":
+            value.type.tensor_type.elem_type = TensorProto.UINT8
 
     def play(observations: Any) -> None:
         OnnxAgent(made.SerializeToString(), agent.suite, agent.config).q_values(observations, 0)
 
-    wrong = np.zeros((3, 2), np.float64 if change == "input" else np.float32)
     with pytest.raises(ExportError, match=reason):
-        play(wrong)
+        play(np.zeros((3, *agent.suite.observation_shape), np.uint8))
     with pytest.raises(ExportError, match="of shape"):
         require_numbers(np.zeros((1, 2), np.float32), 2, np.ones(2, np.bool_), "NIR", "a")
