@@ -15,6 +15,15 @@ from switchmt_snn.config import load_config
 from switchmt_snn.tasks.atari_scores import PUBLISHED_SCORES
 
 NOTES = {
+    "deficit-s1": """\
+The settings of three-held-s3 with seed 1 and the policy `deficit`, which is told the goals (SwitchMT's scores of the
+paper) and gives the next visit to the game that is furthest from its own. The first trial of the study
+`policies_atari`, stopped after 544,944 of 1,000,000 steps; its end is not known.
+**Pong is hardly learned here: -18.5 after 500,000 steps (205,408 of its own), where three-held-s3 had 12.3 after
+400,000.** Breakout (6.0) and Enduro (206.3) come as there. Seed and policy differ, so which of them it is cannot be
+told; but the scores of three-held-s3 are those of one seed, and a seed can be slower.
+`checkpoints/` holds the last weights.
+""",
     "lagging-s1": """\
 Stopped: **Pong diverged.** Its mean Q rises to 8 while it loses every game, because the network that acts and gives
 targets is another one than the network that learns. The background of Pong is a bright constant, 0.42 of the range, so

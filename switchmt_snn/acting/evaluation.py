@@ -73,8 +73,8 @@ class EvaluationProtocol:
         environment: the suite's conditions of play in words, as ``sticky actions 0.25``, and what tasks have become
             (``tasks.later_names``).
         score: what is summed.
-        statistics_batches: from so many batches of each task's replay the normalisation statistics were estimated anew;
-            0: they are those stored with the weights.
+        statistics_batches: the normalisation statistics were re-estimated from so many batches of each task's
+            replay; 0: they are those stored with the weights.
     """
 
     episodes: int
@@ -121,7 +121,7 @@ class EvaluationProtocol:
         if self.max_episode_steps != EvaluationConfig.max_episode_steps:
             played.append(f"episodes of at most {self.max_episode_steps:,} steps")
         if self.statistics_batches:
-            played.append(f"normalisation statistics estimated anew from {self.statistics_batches} batches")
+            played.append(f"normalisation statistics re-estimated from {self.statistics_batches} batches")
         return ", ".join([*played, *self.environment])
 
 

@@ -33,8 +33,8 @@ class EvaluateOptions:
     """What plays. torch: the trained network. onnx: the run's ONNX file in onnxruntime. nir: its NIR files in the NIR
     interpreter."""
     reestimate_batches: int = 0
-    """Estimate normalisation statistics anew, from so many batches of each task's replay: tells a task that is
-    forgotten from one whose statistics are old."""
+    """Re-estimate normalisation statistics from so many batches of each task's replay. Tells a task that is forgotten
+    from one whose statistics are old. 0: those stored with the weights."""
     trust: bool = False
     """Import modules that the run names, although you did not make it: this runs their code."""
     json: bool = False

@@ -126,6 +126,7 @@ def _read(path: Path) -> dict[str, Any]:
             "protocol": dict(stored["protocol"]),
             "tasks": [dict(row) for row in stored["tasks"]],
         }
+        _count(stored["protocol"].get("statistics_batches", 0))
         str(EvaluationProtocol.from_dict(stored["protocol"]))
         for row in stored["tasks"]:
             row["mean"] = math.nan if row["mean"] is None else _number(row["mean"])  # JSON has no NaN

@@ -198,7 +198,7 @@ class RunFolder:
 
     @property
     def reestimated_evaluations(self) -> Evaluations:
-        """The run's evaluations with normalisation statistics estimated anew: not of the weights as they are stored."""
+        """The run's evaluations with re-estimated normalisation statistics: not of the network as it is stored."""
         return Evaluations(self.path / "evaluations" / "reestimated")
 
     def create(self, config: ExperimentConfig, environment: dict[str, Any], asked: ExperimentConfig) -> None:

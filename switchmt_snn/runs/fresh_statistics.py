@@ -1,8 +1,9 @@
-"""A trained network with normalisation statistics estimated anew: what it forgot, apart from what only looks so."""
+"""A trained network with re-estimated normalisation statistics: what it forgot, apart from what only looks so."""
 
 from __future__ import annotations
 
 from switchmt_snn.acting.agent import Agent
+from switchmt_snn.config.bounds import LARGEST
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.learning.parts import make_replay
 from switchmt_snn.learning.statistics import reestimate_from_replay
@@ -11,7 +12,7 @@ from switchmt_snn.spiking.normalization import TaskBatchNorm
 
 
 def with_fresh_statistics(agent: Agent, folder: RunFolder, batches: int) -> Agent:
-    """The agent after its statistics were estimated anew from the replay of its run; the weights stay as they are.
+    """The agent with statistics re-estimated from the replay of its run; the weights stay as they are.
 
     A task whose replay is smaller than a batch keeps its statistics.
 
@@ -24,16 +25,18 @@ def with_fresh_statistics(agent: Agent, folder: RunFolder, batches: int) -> Agen
         ``agent``.
 
     Raises:
-        ConfigError: fewer than one batch; the network has no normalisation, or one whose statistics all tasks share.
+        ConfigError: a number of batches out of range; the network has no normalisation, or one whose statistics all
+            tasks share.
         CheckpointError: the newest checkpoint holds no replay, or none is whole.
         RunFolderError: the agent's weights are of an earlier step than the replay.
     """
     config = agent.config
-    if batches < 1:
-        raise ConfigError(f"statistics are to be estimated from {batches} batches, expected at least 1")
+    most = LARGEST["learning.reestimate_statistics_batches"]
+    if not 1 <= batches <= most:
+        raise ConfigError(f"statistics are to be re-estimated from {batches} batches, expected 1 to {most:,}")
     if not any(isinstance(module, TaskBatchNorm) for module in agent.network.modules()):
         raise ConfigError(
-            "the network has no normalisation, expected one whose statistics can be estimated anew "
+            "the network has no normalisation, expected one whose statistics can be re-estimated "
             "(network.mlp_normalization or stream_normalization: batch); evaluate it as it is"
         )
     if config.network.normalization != "per_task":

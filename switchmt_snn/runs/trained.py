@@ -86,7 +86,7 @@ def evaluate(
         checkpoint: ``last`` or ``best``.
         save: write JSON and CSV to the run's ``evaluations/``.
         note: receives what the user should know meanwhile: episodes that do not end.
-        reestimate_batches: estimate the normalisation statistics anew from so many batches of each task's replay; the
+        reestimate_batches: re-estimate the normalisation statistics from so many batches of each task's replay; the
             files then go to ``evaluations/reestimated/``. 0 takes the stored ones.
         trust: as for ``load_agent``.
         protocol: fields of EvaluationConfig to change (``episodes=5``); the rest is the run's.

@@ -30,7 +30,7 @@ class TaskResult:
             share them.
         visits: how often the task was entered.
         curve: step and mean return of the evaluations during training, and last of the final one.
-        reestimated: as ``mean``, with normalisation statistics estimated anew; None if that was not evaluated.
+        reestimated: as ``mean``, with re-estimated normalisation statistics; None if that was not evaluated.
     """
 
     trial: str
@@ -144,13 +144,13 @@ def _curve(run: Sources, final: dict[str, Any], task: str) -> tuple[tuple[int, f
 
 
 def _reestimated(evaluations: Sequence[dict[str, Any]], final: dict[str, Any]) -> dict[str, float]:
-    """Mean return by task in the evaluations with fresh statistics that have the final one's step, episodes and seed.
+    """Mean return by task with re-estimated statistics, in evaluations with the final one's step, episodes and seed.
 
     Of several, the one of most batches counts.
     """
     keys = ("episodes", "epsilon", "seed")
     found: dict[str, float] = {}
-    for one in sorted(evaluations, key=lambda one: int(one["protocol"]["statistics_batches"])):
+    for one in sorted(evaluations, key=lambda one: int(one["protocol"].get("statistics_batches", 0))):
         same = all(one["protocol"].get(key) == final["protocol"].get(key) for key in keys)
         if same and one["step"] == final["step"]:
             found |= {row["task"]: float(row["mean"]) for row in one["tasks"] if row["policy"] == "agent"}

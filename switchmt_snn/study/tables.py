@@ -347,10 +347,10 @@ def _over_training(found: Results) -> Table | None:
         "earlier score minus the final one; a best over noisy evaluations is too high, so compare variants only."
     )
     if any(row.reestimated is not None for one in found.results for row in one.tasks):
-        measures["lost with fresh statistics"] = lost_with_fresh_statistics
+        measures["lost, re-estimated"] = lost_with_fresh_statistics
         note += (
-            " With fresh statistics: the final network's normalisation statistics were estimated anew from the "
-            "replays (evaluate --reestimate-batches): what is then not lost was not forgotten by the weights."
+            " Re-estimated: with the final network's normalisation statistics re-estimated from the replays (evaluate "
+            "--reestimate-batches). What is then not lost was not forgotten by the weights."
         )
     rows = [
         (name, *(value for measure in measures.values() for value in _by_task(found, name, measure)))

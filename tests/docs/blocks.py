@@ -16,7 +16,6 @@ of them do; lines that need a shell run in one.
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 import re
@@ -25,9 +24,9 @@ import shlex
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -130,24 +129,14 @@ class Reader:
 
     def _fork(self, words: list[str], block: Block) -> None:
         printed = self.folder / ".printed"
-        with _environment({"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}):  # of the process that imports
+        importing = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+        with mock.patch.dict(os.environ, importing):  # of the process that imports
             context = multiprocessing.get_context("forkserver")
             context.set_forkserver_preload(_IMPORTED)
             process = context.Process(target=_run_here, args=(words, self.folder, self.environment, printed))
             process.start()
         process.join()
         assert process.exitcode == 0, f"{block}\n{shlex.join(words)}\n{printed.read_text()[-6000:]}"
-
-
-@contextlib.contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    before = dict(os.environ)
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
 
 
 def _run_here(words: list[str], folder: Path, environment: dict[str, str], printed: Path) -> None:

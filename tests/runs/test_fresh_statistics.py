@@ -123,7 +123,7 @@ def test_evaluations_with_fresh_statistics_are_kept_apart(tmp_path: Path, capsys
     (kept,) = RunFolder(run).reestimated_evaluations.all()
     assert kept["tasks"] == played["tasks"]
     assert str(EvaluationProtocol.from_dict(kept["protocol"])).endswith(
-        "normalisation statistics estimated anew from 2 batches"
+        "normalisation statistics re-estimated from 2 batches"
     )
 
 
@@ -133,7 +133,7 @@ def test_statistics_that_cannot_be_estimated_are_refused_in_one_line(tmp_path: P
     agent.step = 40
     with pytest.raises(RunFolderError, match="the weights are of step 40 and the replay is of step 60, expected those"):
         with_fresh_statistics(agent, run, 2)
-    with pytest.raises(ConfigError, match="from -1 batches, expected at least 1"):
+    with pytest.raises(ConfigError, match="from -1 batches, expected 1 to 1,000,000"):
         evaluate(run.path, reestimate_batches=-1)
     pack(run.path, tmp_path / "packed")
     with pytest.raises(CheckpointError, match="holds weights only"):

@@ -119,7 +119,7 @@ def test_what_fresh_statistics_restore_stands_beside_what_was_lost(
     cells = dict(zip(table.columns, table.rows[0], strict=True))
     for row in first.tasks:
         earlier = max(mean for _, mean in row.curve[:-1])
-        assert cells[f"lost with fresh statistics {row.task}"].value == pytest.approx(earlier - row.mean - 1.0)
+        assert cells[f"lost, re-estimated {row.task}"].value == pytest.approx(earlier - row.mean - 1.0)
         assert cells[f"lost {row.task}"].value == pytest.approx(earlier - row.curve[-1][1])
 
 

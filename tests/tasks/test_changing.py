@@ -161,6 +161,20 @@ def test_a_later_task_has_the_same_actions() -> None:
         make_suite(replace(TASKS, later_names=("Acrobot-v1", "Acrobot-v1")))
 
 
+def test_random_play_finds_the_goal_of_the_held_mountain_car_only() -> None:
+    reached = {}
+    for name in ("MountainCar-v0", "switchmt_snn.tasks.held_mountain_car:HeldMountainCar-v0"):
+        env, rng, goals = gymnasium.make(name), np.random.default_rng(0), 0
+        for seed in range(300):
+            env.reset(seed=seed)
+            terminated = truncated = False
+            while not (terminated or truncated):
+                _, _, terminated, truncated, _ = env.step(int(rng.integers(3)))
+            goals += terminated
+        reached[name.rsplit(":", 1)[-1]] = goals
+    assert reached == {"MountainCar-v0": 0, "HeldMountainCar-v0": 3}
+
+
 def test_a_held_action_is_eight_steps_of_mountain_car() -> None:
     held = gymnasium.make("switchmt_snn.tasks.held_mountain_car:HeldMountainCar-v0")
     plain = gymnasium.make("MountainCar-v0")
