@@ -17,13 +17,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch._dynamo
+
 import switchmt_snn.viewing.report.page
 from switchmt_snn.cli import main
 from switchmt_snn.export import export_run, profile_run
 from switchmt_snn.runs import run as runs_run
 
-IMPORTED = (switchmt_snn.viewing.report.page, export_run, profile_run, runs_run)
-"""Before the forks, once."""
+IMPORTED = (switchmt_snn.viewing.report.page, export_run, profile_run, runs_run, torch._dynamo)
+"""Before the forks, once; PyTorch's optimizers import torch._dynamo, which takes seconds."""
 ENDED = 77
 CONFIG = """
 name: crash
@@ -32,7 +34,8 @@ total_steps: 260
 threads: 1
 tasks: {suite: gym, names: [CartPole-v1]}
 network: {hidden_units: 8, timesteps: 2}
-learning: {batch_size: 4, learning_starts_steps: 20, replay_capacity_steps: 300, learning_rate: 0.01}
+learning: {batch_size: 4, learning_starts_steps: 20, replay_capacity_steps: 300, learning_rate: 0.01,
+  update_every_steps: 4}
 evaluation: {episodes: 2, epsilon: 0.0, every_steps: 120, max_episode_steps: 60}
 recording: {checkpoint_every_steps: 80, metrics_every_steps: 100, keep_checkpoints: 2}
 """
