@@ -164,7 +164,7 @@ def _statistics(folder: Path) -> list[str]:
         found = list(csv.DictReader(stream))
     lines = [
         "",
-        "The network that acts against the same network with BatchNorm statistics estimated anew from the replay",
+        "The network that acts against the same network with BatchNorm statistics re-estimated from the replay",
         "(`python -m benchmarks.running_statistics RUN`): correlation of the largest Q-values, how often both choose",
         "the same action, mean largest Q-value, and how far a layer's running means are off in standard deviations",
         "(median).",

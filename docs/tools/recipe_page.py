@@ -49,7 +49,7 @@ STATISTICS = """\
 
 Three games in one network, `results/atari/lagging-s1/config.yaml` and the changes below, each run stopped after the
 steps given. Training normalises by the batch; acting and targets use BatchNorm's running statistics. Compared with the
-same network with statistics estimated anew over 1,024 observations (`python -m benchmarks.running_statistics RUN`):
+same network with statistics re-estimated over 1,024 observations (`python -m benchmarks.running_statistics RUN`):
 correlation of the largest Q-values, share of observations with the same action, mean largest Q-value with both, the
 same of the target network, and how far the running means of conv1 and conv2 are off, in standard deviations (median).
 
@@ -58,7 +58,7 @@ same of the target network, and how far the running means of conv1 and conv2 are
 STATISTICS_READING = """\
 Running means of currents lag 0.2 standard deviations behind the weights on Pong, whose background is bright; Q-values
 and actions are then hardly those that were learned, and Q diverges (`results/atari`). The mean from the input cures
-conv1. Statistics that are estimated anew at each copy cure targets, which were biased by 0.2.
+conv1. Statistics that are re-estimated at each copy cure targets, which were biased by 0.2.
 The rest is the lag of deeper layers of the network that acts and chooses. Running statistics of two batches
 (`normalization_momentum: 0.5`) do not cure it: conv2's mean moves by some hundredths of a standard deviation at each
 update. Single batches give nearly the same Q-values as many (correlation 0.95 to 0.97 on Pong and Breakout), so noise

@@ -42,8 +42,8 @@ class LearningConfig:
     it, else float32."""
     engine: Literal["auto"] | Engine = "auto"
     """How updates are executed. eager: PyTorch. native: C++ (CPU only, compiled once in about 7 s). compiled:
-    torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for Atari-size
-    networks and long runs on vectors, if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or
+    torch.compile (20-35 s at each start). graph: a CUDA graph. Engines differ in rounding. auto: native for long runs
+    on vectors, and for Atari-size networks if AVX-512 or bfloat16 is available; compiled for runs of 150,000 updates or
     more; else eager."""
     acting_network: Literal["online", "target"] = "online"
     """By whose Q-values training acts: Q's, or those of Q*, whose weights stay with their BatchNorm statistics from one
@@ -87,7 +87,7 @@ class LearningConfig:
     target_update_every_updates: int | None = None
     """Count these copies in updates, over all tasks: a number takes the place of target_update_every_steps."""
     reestimate_statistics_batches: int = 0
-    """Estimate BatchNorm's running statistics of Q anew from so many batches of each task's replay: before each copy to
+    """Re-estimate BatchNorm's running statistics of Q from so many batches of each task's replay: before each copy to
     Q*, when a visit to the task starts, and if Q acts before an evaluation and at the end. Running statistics belong to
     past weights: targets are biased, and a task that was away looks forgotten. 0: off."""
     first_layer_mean: Literal["running", "input"] = "running"

@@ -6,8 +6,9 @@ and what the report writes: tables.md  study.json  trials.csv  scores.csv  decis
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import suppress
+import shlex
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -124,14 +125,17 @@ class StudyFolder:
 
     def _require_same(self, study: Study) -> None:
         known = {trial.name: trial for trial in study.trials}
-        gone = [trial.name for trial in self.study().trials if trial.name not in known]
+        with self._reading_trials() as listing:
+            stored = [folder_name(one["name"]) for one in listing["trials"]]
+        gone = [name for name in stored if name not in known]
         if gone:
             raise ConfigError(
                 f"{self.path} holds trials that are not in the study: {', '.join(gone[:5])}, expected the same study "
                 "(seeds and variants may be added); name another folder with --folder"
             )
-        for trial in self.study().trials:
-            changed = differences(trial.config, known[trial.name].config)
+        for trial in map(known.__getitem__, stored):
+            path = self.config(trial)
+            changed = differences(load_config(path, stored=True), trial.config) if path.is_file() else {}
             if changed:
                 shown = ", ".join(f"{key} ({old!r} -> {new!r})" for key, (old, new) in sorted(changed.items())[:5])
                 raise ConfigError(
@@ -143,27 +147,36 @@ class StudyFolder:
         """The study as it was begun.
 
         Raises:
-            RunFolderError: there is none, or its trials.json cannot be read.
+            RunFolderError: there is none, its trials.json cannot be read, or the config of a trial is missing.
         """
         self.require()
-        path = self.path / "trials.json"
-        try:
-            stored = parsed_json(path.read_bytes())
+        with self._reading_trials() as stored:
             trials = tuple(
-                Trial(
-                    name=folder_name(one["name"]),
-                    variant=str(one["variant"]),
-                    seed=int(one["seed"]),
-                    config=load_config(self.path / "configs" / f"{one['name']}.yaml", stored=True),
-                )
+                Trial(folder_name(one["name"]), str(one["variant"]), int(one["seed"]), self._stored_config(one["name"]))
                 for one in stored["trials"]
             )
             modules = _modules_of(trials)
             if is_signed(modules, stored.get(SIGNATURE)):
                 allow(modules)
             return Study(str(stored["name"]), trials, dict(stored["references"]), str(stored["baseline"]))
+
+    @contextmanager
+    def _reading_trials(self) -> Iterator[Any]:
+        """What trials.json says; what a caller cannot make of it is an error of the folder."""
+        path = self.path / "trials.json"
+        try:
+            yield parsed_json(path.read_bytes())
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunFolderError(f"{path} cannot be read ({error!s:.80}), expected a study's list of trials") from error
+
+    def _stored_config(self, name: str) -> ExperimentConfig:
+        path = self.path / "configs" / f"{name}.yaml"
+        if not path.is_file():
+            raise RunFolderError(
+                f"{path} is missing, expected the config of every trial; write it again with: "
+                f"switchmt-snn study CONFIG --folder {shlex.quote(str(self.path))}"
+            )
+        return load_config(path, stored=True)
 
     def lock(self) -> filelock.BaseFileLock:
         """Take the study for this process.

@@ -53,15 +53,15 @@ class Native(Engine):
     @classmethod
     def pays(cls, config: ExperimentConfig, device: torch.device, precision: str) -> bool:
         """On the nature trunk it is the fastest engine (docs/performance.md) if its products of spikes are sums over
-        bits, or the other products are bfloat16. On the mlp trunk it takes about half of eager's time, which pays for
-        building it in runs of some thousand updates. MinAtar's small network is faster compiled.
+        bits, or the other products are bfloat16. On the mlp trunk it takes about half of eager's time, also with AVX2
+        alone, which pays for building it in runs of some thousand updates. MinAtar's small network is faster compiled.
         """
         spiking = METHOD_TRAITS[config.network.method].spiking
         trunk, is_short = config.network.trunk, planned_updates(config) < BUILD_FROM_UPDATES
         if device.type != "cpu" or not spiking or trunk == "minatar" or (trunk == "mlp" and is_short):
             return False
         supports = _supports()
-        if precision == "bfloat16" or supports is None or supports.problem() is not None:
+        if trunk == "mlp" or precision == "bfloat16" or supports is None or supports.problem() is not None:
             return True  # if it cannot be built, unavailable() says why
         return bool(supports.spikes_as_bits(torch.float32))
 

@@ -255,6 +255,11 @@ def test_a_folder_takes_more_trials_but_no_other_ones(tmp_path: Path) -> None:
         folder.prepare(load_study(tiny(path, "seeds: 2\n")))
     with pytest.raises(ConfigError, match=r"holds s_seed1 with another config: network.timesteps \(2 -> 3\)"):
         folder.prepare(load_study(path, ["network.timesteps=3"], [1, 2, 3]))
+    folder.config(folder.study().trials[1]).unlink()
+    with pytest.raises(RunFolderError, match=r"s_seed2.yaml is missing, expected the config of every trial; write it"):
+        folder.study()
+    folder.prepare(load_study(tiny(path, "seeds: 3\n")))
+    assert folder.study() == load_study(path)
     strange = tmp_path / "strange"
     strange.mkdir()
     (strange / "thesis.tex").touch()

@@ -45,12 +45,13 @@ def test_auto_is_native_on_the_nature_trunk_if_that_is_the_fastest(
     assert settled(trunk, precision, "eager") == ("eager", [])
 
 
+@pytest.mark.parametrize("has_bits", [True, False])
 @pytest.mark.parametrize(("total_steps", "expected"), [(4_999, "eager"), (5_000, "native")])
 def test_auto_builds_the_native_engine_for_vectors_if_a_run_makes_enough_updates(
-    total_steps: int, expected: str, monkeypatch: pytest.MonkeyPatch
+    total_steps: int, expected: str, has_bits: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supports, "problem", lambda: None)
-    monkeypatch.setattr(supports, "spikes_as_bits", lambda dtype: True)
+    monkeypatch.setattr(supports, "spikes_as_bits", lambda dtype: has_bits)
     assert decided(small_config(total_steps=total_steps))[0].learning.engine == expected
 
 
