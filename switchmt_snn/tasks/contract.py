@@ -13,26 +13,39 @@ from switchmt_snn.tasks.suite import Frames, Picture, TaskSuite, VectorStep
 
 METHODS = {
     "make": "make(task, num_envs) -> the copies of a task",
-    "reset": "reset(env_ids, seeds) -> frames; of a Gymnasium environment, reset(seed=...) -> (observation, info)",
-    "step": "step(actions) -> VectorStep; of a Gymnasium environment, step(action) -> (observation, reward, "
-    "terminated, truncated, info)",
+    "reset": "reset(env_ids, seeds) -> frames",
+    "step": "step(actions) -> VectorStep",
     "close": "close()",
-    "picture": 'picture(env_id) -> uint8 [H, W, 3] or None; of a Gymnasium environment, render() with "rgb_array"',
+    "picture": "picture(env_id) -> uint8 [H, W, 3] or None",
 }
-"""What environments must have, in words; ``picture`` is for those that can be drawn."""
+"""What a suite's environments must have, in words; ``picture`` is for those that can be drawn."""
+
+GYMNASIUM_METHODS = {
+    "reset": "reset(*, seed=None, options=None) -> (observation, info)",
+    "step": "step(action) -> (observation, reward, terminated, truncated, info)",
+    "close": "close()",
+    "picture": 'render() -> uint8 [H, W, 3] with render_mode "rgb_array"',
+}
+"""The same of a Gymnasium environment."""
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
 """Replay memories hold rewards as float32."""
 
 
-def task_code(name: str, where: str) -> AbstractContextManager[None]:
+def task_code(name: str, where: str, methods: dict[str, str] = METHODS) -> AbstractContextManager[None]:
     """Around a call of an environment's own code: what it raises becomes one line.
 
     Args:
         name: of the task.
-        where: the method, one of ``METHODS``.
+        where: the method, one of ``methods``.
+        methods: what is expected of each, in words.
     """
-    return user_code(f"task {name!r} fails in {where}", METHODS[where], TaskError)
+    return user_code(f"task {name!r} fails in {where}", methods[where], TaskError)
+
+
+def gymnasium_code(name: str, where: str) -> AbstractContextManager[None]:
+    """As ``task_code``, around a Gymnasium environment, whose methods have other arguments than a suite's."""
+    return task_code(name, where, GYMNASIUM_METHODS)
 
 
 class CheckedEnvironment:

@@ -17,7 +17,7 @@ from switchmt_snn.config.plugins import import_plugin_module, is_plugin
 from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.changing import all_names
-from switchmt_snn.tasks.contract import task_code
+from switchmt_snn.tasks.contract import gymnasium_code
 from switchmt_snn.tasks.gym_copies import GymCopies, GymCopy, first_action, is_outside
 from switchmt_snn.tasks.gym_make import make_environment, parse_id
 from switchmt_snn.tasks.gym_processes import GymProcesses
@@ -66,7 +66,7 @@ class GymSuite(Suite):
         first_actions = tuple(first_action(env) for env in probes)
         is_gymnasiums = not any(is_outside(env) for env in probes)
         for name, env in zip(names, probes, strict=True):
-            with task_code(name, "close"):
+            with gymnasium_code(name, "close"):
                 env.close()
         _require_one_kind(names, layouts)
         frame_shape = tuple(int(side) for side in np.max(np.asarray([layout.shape for layout in layouts]), axis=0))

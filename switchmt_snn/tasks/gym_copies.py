@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from switchmt_snn.errors import MissingExtraError, TaskError, shown
+from switchmt_snn.tasks.contract import gymnasium_code
 from switchmt_snn.tasks.gym_spaces import LARGEST_WHOLE, RoundedObservation
+from switchmt_snn.tasks.masked import FILL, has_masked_values
 from switchmt_snn.tasks.randomness import OwnGenerators
 from switchmt_snn.tasks.suite import Frames, Picture, VectorStep
 
@@ -67,7 +69,7 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
                 space.seed(seed)
         if self._before_reset is not None:
             self._before_reset(self.env)
-        with self._generators or _NOTHING:
+        with gymnasium_code(self._name, "reset"), self._generators or _NOTHING:
             answer = self.env.reset(seed=seed)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             raise TaskError(f"task {self._name!r} gave {shown(answer)} from reset, expected (observation, info)")
@@ -75,7 +77,7 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step; the environment's info is left out."""
-        with self._generators or _NOTHING:
+        with gymnasium_code(self._name, "step"), self._generators or _NOTHING:
             observation, reward, ended, cut, _ = self.env.step(int(action) + self._first_action)
         number = self._one_number(reward)
         terminated, truncated = self._truth("terminated", ended), self._truth("truncated", cut)
@@ -89,17 +91,23 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         """
         if self.env.render_mode != "rgb_array":
             return None
-        try:
-            with self._drawing:  # what drawing takes from the global generators, the play does not miss
-                picture = self.env.render()
-        except gymnasium.error.DependencyNotInstalled as error:
-            raise MissingExtraError(
-                f"pictures of {self._name} need a package that is not installed ({error}); "
-                "run: pip install 'switchmt-snn[video]'"
-            ) from error
+        with gymnasium_code(self._name, "picture"):
+            try:
+                with self._drawing:  # what drawing takes from the global generators, the play does not miss
+                    picture = self.env.render()
+            except gymnasium.error.DependencyNotInstalled as error:
+                raise MissingExtraError(
+                    f"pictures of {self._name} need a package that is not installed ({error}); "
+                    "run: pip install 'switchmt-snn[video]'"
+                ) from error
         array = np.asarray(picture)
         # MinAtar's colours go from 0 to 1.
         return np.rint(255 * array).astype(np.uint8) if array.dtype.kind == "f" else array
+
+    def close(self) -> None:
+        """Close the environment."""
+        with gymnasium_code(self._name, "close"):
+            super().close()
 
     @property
     def draws_globally(self) -> bool:
@@ -109,6 +117,8 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
     def _frame(self, observation: Any) -> npt.NDArray[Any]:
         """Compare an observation with its space, and make its frame."""
         space = self.env.observation_space
+        if has_masked_values(observation):
+            raise TaskError(f"task {self._name!r} gave a masked array as observation, expected plain numbers; {FILL}")
         try:
             array = np.asarray(observation)
         except (ValueError, TypeError):  # a tuple or list of unequal lengths

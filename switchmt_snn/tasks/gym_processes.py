@@ -21,7 +21,6 @@ import numpy.typing as npt
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from switchmt_snn.errors import TaskError
-from switchmt_snn.tasks.contract import task_code
 from switchmt_snn.tasks.gym_copies import GymCopy
 from switchmt_snn.tasks.suite import Frames, VectorStep
 
@@ -52,7 +51,7 @@ class GymProcesses:
             others = multiprocessing.active_children()
             try:
                 self._vector = AsyncVectorEnv(
-                    [partial(_here, name, make)] * num_envs, context=context, autoreset_mode=AutoresetMode.DISABLED
+                    [partial(_here, make)] * num_envs, context=context, autoreset_mode=AutoresetMode.DISABLED
                 )
             except BaseException:  # Ctrl-C: a process that starts would miss what is freed now, with a traceback
                 for process in set(multiprocessing.active_children()) - set(others):
@@ -125,23 +124,20 @@ def _nothing() -> None:
 
 
 class _Reporting(gymnasium.Wrapper[Any, int, Any, int]):
-    """A copy in a process of its own: an exception becomes its one line here, where its place is known.
-
-    Warnings go to the main process, which shows each of them once; every process would.
+    """A copy in a process of its own: its warnings go to the main process, which shows each of them once; every process
+    would.
     """
 
-    def __init__(self, name: str, copy: GymCopy, heard: list[_Heard]) -> None:
+    def __init__(self, copy: GymCopy, heard: list[_Heard]) -> None:
         super().__init__(copy)
-        self._name, self._heard = name, heard
+        self._heard = heard
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        with task_code(self._name, "reset"):
-            frame, _ = self.env.reset(seed=seed, options=options)
+        frame, _ = self.env.reset(seed=seed, options=options)
         return frame, self._told()
 
     def step(self, action: int) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        with task_code(self._name, "step"):
-            frame, reward, terminated, truncated, _ = self.env.step(action)
+        frame, reward, terminated, truncated, _ = self.env.step(action)
         return frame, reward, terminated, truncated, self._told()
 
     def _told(self) -> dict[str, Any]:
@@ -152,7 +148,7 @@ class _Reporting(gymnasium.Wrapper[Any, int, Any, int]):
         return told
 
 
-def _here(name: str, make: Callable[[], GymCopy]) -> _Reporting:
+def _here(make: Callable[[], GymCopy]) -> _Reporting:
     """In a process of a copy: make it. Ctrl-C is for the main process, which ends the others."""
     heard: list[_Heard] = []
     if multiprocessing.parent_process() is not None:
@@ -169,7 +165,7 @@ def _here(name: str, make: Callable[[], GymCopy]) -> _Reporting:
             heard.append((str(message), filename, lineno))
 
         warnings.showwarning = hear
-    return _Reporting(name, make(), heard)
+    return _Reporting(make(), heard)
 
 
 _WARNINGS = "warnings"

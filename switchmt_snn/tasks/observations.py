@@ -9,6 +9,7 @@ import numpy.typing as npt
 import torch
 
 from switchmt_snn.errors import TaskError
+from switchmt_snn.tasks.masked import FILL, has_masked_values
 from switchmt_snn.tasks.suite import TaskSuite
 
 
@@ -39,6 +40,8 @@ def _array(observation: Any) -> npt.NDArray[Any]:
     if isinstance(observation, torch.Tensor):
         tensor = observation.detach().cpu()
         return np.asarray((tensor.float() if tensor.is_floating_point() else tensor).numpy())
+    if has_masked_values(observation):
+        raise TaskError(f"the observation is a masked array, expected plain numbers; {FILL}")
     try:
         return np.asarray(observation)
     except (ValueError, TypeError):  # lists of unequal lengths

@@ -179,6 +179,7 @@ def test_observations_of_any_container_and_type_are_the_same_numbers() -> None:
         (np.asarray([0.0, 1e300, 0.0, 0.0]), r"has values from 0 to 1e\+300, expected finite numbers \(float32\)"),
         (np.asarray(["a"] * 4), "is of type <U1, expected raw numbers"),
         (np.asarray([1j] * 4), "is of type complex128, expected raw numbers"),
+        (np.ma.MaskedArray(np.zeros(4), [0, 0, 1, 0]), r"is a masked array, expected plain numbers; .*filled\(0\)"),
         (None, r"has shape \(\)"),
         ([[1.0], [1.0, 2.0]], r"has shape \(\)"),
     ],

@@ -84,6 +84,20 @@ class GrowingDouble(Plain):
         return later(np.zeros(4), np.full(4, 2.0**24 + 3), self)
 
 
+class MaskedObservation(Plain):
+    """Plain numbers at first; then the mask hides one."""
+
+    def observe(self) -> Any:
+        return later(
+            np.ma.MaskedArray(np.ones(4, np.float32)), np.ma.MaskedArray(np.ones(4, np.float32), [0, 1, 0, 0]), self
+        )
+
+
+class ResetWithoutOptions(Plain):
+    def reset(self, seed=None):  # type: ignore[no-untyped-def]
+        return super().reset(seed=seed)
+
+
 class CannotClose(Plain):
     def close(self) -> None:
         raise RuntimeError("still open")

@@ -61,6 +61,7 @@ def rewards(suite: TaskSuite, steps: int = 20, num_envs: int = 1) -> list[list[f
         ("TextObservation", "gave an observation of type <U1, expected float32, the type of its observation_space"),
         ("NanObservation", "gave observations from nan to nan, expected finite numbers"),
         ("HugeObservation", "gave observations from inf to inf, expected finite numbers"),
+        ("MaskedObservation", r"gave a masked array as observation, expected plain numbers; .* array.filled\(0\)$"),
         ("NanReward", r"gave the rewards \[nan\], expected finite numbers"),
         ("InfiniteReward", r"gave the rewards \[inf\], expected finite numbers"),
         ("HugeReward", r"gave the rewards \[-1e\+39\], expected finite numbers"),
@@ -85,6 +86,13 @@ def test_a_reset_without_info_is_named() -> None:
     """Gymnasium's own checker only warns."""
     with pytest.raises(TaskError, match=r"gave array\(\[0., 0.\].*\) from reset, expected \(observation, info\)"):
         begun(suite_of("ResetWithoutInfo"))
+
+
+@pytest.mark.filterwarnings("ignore")  # as above
+def test_a_reset_without_options_is_told_gymnasiums_signature_and_not_a_suites() -> None:
+    expected = r"keyword argument 'options'\), expected reset\(\*, seed=None, options=None\) -> \(observation, info\)$"
+    with pytest.raises(TaskError, match=expected):
+        begun(suite_of("ResetWithoutOptions"))
 
 
 @pytest.mark.parametrize(
