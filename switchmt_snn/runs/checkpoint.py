@@ -146,8 +146,7 @@ class CheckpointStore:
         facts = {"step": step, "acting_network": acting_network, "segments": segments, "logs": log_sizes}
         self._write_folder(final, files, facts)
         sync_folder(self.folder)
-        with writing(self.folder):
-            self._remove_old(final)
+        self.remove_old(step)
         return final
 
     def save_best(self, step: int, network_state: dict[str, torch.Tensor], score: float, judged_by: str) -> None:
@@ -204,12 +203,20 @@ class CheckpointStore:
                     self._stored[key] = entry
             yield entry
 
-    def _remove_old(self, saved: Path) -> None:
-        """Drop what is older than the newest ``keep`` up to the saved one.
+    def remove_old(self, step: int) -> None:
+        """Drop what is older than the newest ``keep`` up to the one of ``step``, and what no checkpoint refers to.
 
-        Those of a later step are damaged: the run went on from one before them. They count for nothing.
+        A save does it, and whoever continues a run: a process that was killed may have left half of it. Those of a
+        later step are damaged: the run went on from one before them. They count for nothing.
+
+        Raises:
+            WriteError: the system refused.
         """
-        for path in [path for path in self.paths() if path.name <= saved.name][self.keep :]:
+        with writing(self.folder):
+            self._remove_old(_name(step))
+
+    def _remove_old(self, newest: str) -> None:
+        for path in [path for path in self.paths() if path.name <= newest][self.keep :]:
             # Without its manifest a half-removed folder is no checkpoint any more.
             (path / "manifest.json").unlink(missing_ok=True)
             shutil.rmtree(path, ignore_errors=True)

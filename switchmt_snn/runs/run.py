@@ -278,6 +278,7 @@ class _Driver:
             self.initial.give(self.training.learner)
             return None, None, [f"begins with the weights of {self.initial.run} after {self.initial.step:,} steps"]
         loaded = self.store.load(self.training.replays)
+        self.store.remove_old(loaded.step)
         with fitting_weights():
             self.training.load_state_dict(loaded.state)
         notes = [f"{text}; continuing from the one before it" for text in loaded.damaged]

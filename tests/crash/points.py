@@ -172,7 +172,7 @@ def products(folder: Path) -> dict[str, Any]:
         name = str(path.relative_to(folder / "run"))
         if (
             path.is_file()
-            and not name.endswith((".lock", ".log", ".zst", ".html", ".svg", ".png"))
+            and not name.endswith((".lock", ".log", ".html", ".svg", ".png"))
             and "environment" not in name
             and name != "attempts.jsonl"  # a study's processes, of which a crash ends one
         ):

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import random
+import shutil
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,18 @@ def test_a_run_that_was_killed_before_its_page_was_written_gets_it(finished: Pat
     assert run_until(words("train", tmp_path / "again"), tmp_path / "again", None)[0] == 0
     assert products(tmp_path / "again") == expected
     assert (tmp_path / "again" / "run" / "report.html").is_file()
+
+
+def test_what_a_killed_run_left_half_removed_is_removed_by_the_next_command(finished: Path, tmp_path: Path) -> None:
+    """Also after the last checkpoint, which no other one follows."""
+    expected = products(finished)
+    prepared("report", tmp_path / "again", finished)
+    checkpoints = tmp_path / "again" / "run" / "checkpoints"
+    shutil.copytree(checkpoints / "step-000000000240", checkpoints / "step-000000000080")
+    (checkpoints / "step-000000000080" / "manifest.json").unlink()
+    (checkpoints / "replay" / f"{'0' * 64}.zst").write_bytes(b"of no checkpoint")
+    assert run_until(words("train", tmp_path / "again"), tmp_path / "again", None)[0] == 0
+    assert products(tmp_path / "again") == expected
 
 
 def test_a_crash_ends_the_command_and_leaves_its_files(tmp_path: Path) -> None:
