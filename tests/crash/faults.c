@@ -81,7 +81,8 @@ static int fails_open(const char *call, int file, int needs_room) {
       mode = va_arg(rest, mode_t);                                                                                    \
       va_end(rest);                                                                                                   \
     }                                                                                                                 \
-    if ((flags & WRITES) && fails_at("open", parent, path, flags & O_CREAT)) return -1;                               \
+    const char *call = (flags & O_TMPFILE) == O_TMPFILE ? "open unnamed" : "open";                                    \
+    if ((flags & WRITES) && fails_at(call, parent, path, flags & O_CREAT)) return -1;                               \
     return REAL(name) arguments;                                                                                      \
   }
 OPEN(open, (const char *path, int flags, ...), AT_FDCWD, (path, flags, mode))

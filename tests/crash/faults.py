@@ -32,6 +32,8 @@ FAULTS = {"full": (errno.ENOSPC, True), "broken": (errno.EIO, False)}
 """The error, and whether it stays."""
 _TEMPORARY = re.compile(r"\.tmp\b|/\.|/tmp")
 _DECORATED = re.compile(r"/\.([^/]+?)(\.[0-9]+(-[0-9a-f]+)?|\.[0-9a-z_]{8})?\.tmp\b")
+_UNNEEDED = ("mkdir", "open unnamed")
+"""Calls that may fail: the folder was there; Python then takes a temporary file with a name."""
 _NEEDLESS = "no report: "
 """How the line begins by which a training says that it ended well, but for its page."""
 
@@ -84,7 +86,7 @@ def outcome(command: str, folder: Path, finished: Path, expected: dict[str, Any]
         wrong = [*wrong, f"left {', '.join(one.replace(str(folder), '') for one in left)}"]
     if wrong:
         return f"{where}: {'; '.join(wrong)}"
-    if code != 0 or facts["call"] != "mkdir":
+    if code != 0 or facts["call"] not in _UNNEEDED:
         code, _ = run_until(words(command, folder), folder, None)
     if code != 0:
         return f"{where}: the same command again ends with exit code {code}: {log.read_text()[-300:]!r}"
@@ -97,8 +99,8 @@ def _wrong(command: str, code: int, text: str, facts: dict[str, Any], cause: str
     if "Traceback" in text:
         return [f"a traceback: {text[-400:]!r}"]
     lines = [line for line in text.splitlines() if line.startswith(("switchmt-snn: ", _NEEDLESS))]
-    if code == 0 and not lines and facts["call"] == "mkdir":
-        return []  # the folder was there
+    if code == 0 and not lines and facts["call"] in _UNNEEDED:
+        return []
     needless = bool(lines) and lines[-1].startswith(_NEEDLESS) and command.startswith(("train", "study"))
     if code != (0 if needless else 1) or len(lines) != 1:
         return [f"exit code {code}, {lines or text[-200:]}"]
