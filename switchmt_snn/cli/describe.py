@@ -10,6 +10,7 @@ import tyro
 
 from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, split_one
 from switchmt_snn.config import ExperimentConfig, load_config
+from switchmt_snn.errors import RunFolderError, printable
 from switchmt_snn.viewing import output
 
 
@@ -52,8 +53,15 @@ def command(argv: list[str]) -> int:
 
 def _config_of(source: str) -> ExperimentConfig:
     """The config of a file, a preset, or a run."""
+    from switchmt_snn.runs.folder import RunFolder
     from switchmt_snn.runs.packing import is_pretrained, open_run
 
-    if Path(source).is_dir() or is_pretrained(source):
+    is_folder = Path(source).is_dir()
+    if is_folder and not RunFolder(Path(source)).is_run:
+        raise RunFolderError(
+            f"{printable(source)} is a folder without a run, expected a config (YAML file or preset), a run folder, or "
+            "pretrained/NAME"
+        )
+    if is_folder or is_pretrained(source):
         return load_config(open_run(source).path / "config.yaml")
     return load_config(source)
