@@ -25,21 +25,18 @@ STREAMS = ("q", "value", "advantage")
 
 
 class ReturnsSeen:
-    """What the training episodes so far say about returns and rewards.
+    """What the training episodes so far say about returns.
 
     Attributes:
         largest_return: in absolute value; None before an episode ended.
-        reward_reached: some reward was at least so large, in absolute value: the largest mean reward of an episode.
     """
 
     def __init__(self) -> None:
         self.largest_return: float | None = None
-        self.reward_reached = 0.0
 
-    def add(self, episode_return: float, length_steps: int) -> None:
+    def add(self, episode_return: float) -> None:
         """Take in an episode that ended."""
         self.largest_return = max(self.largest_return or 0.0, abs(episode_return))
-        self.reward_reached = max(self.reward_reached, abs(episode_return) / max(length_steps, 1))
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ def health_warnings(measured: Measured, config: ExperimentConfig, returns: Retur
     if measured.q is not None and math.isfinite(measured.q) and abs(measured.q) > LARGE_FACTOR * bound:
         warnings["large Q"] = Warned(
             f"mean Q is {measured.q:.3g}, expected at most about {bound:.3g}: values explode",
-            tuple(_for_large_values(config, returns)),
+            _for_large_values(config),
         )
     return warnings
 
@@ -161,16 +158,13 @@ def _normalization(layer: str, network: NetworkConfig) -> list[Remedy]:
     return [] if has else [Remedy(f"network.{key}", "batch", f"use network.{key}=batch")]
 
 
-def _for_large_values(config: ExperimentConfig, returns: ReturnsSeen) -> list[Remedy]:
+def _for_large_values(config: ExperimentConfig) -> tuple[Remedy, ...]:
+    """What slows the targets. Huber's loss and clipped gradients do not: Adam divides gradients by their size."""
     learning = config.learning
-    remedies = [_lower_learning_rate(config)]
-    if learning.loss == "mse":
-        remedies.append(Remedy("learning.loss", "huber", "use learning.loss=huber"))
-    if learning.gradient_clip == "none":
-        remedies.append(Remedy("learning.gradient_clip", "norm", "use learning.gradient_clip=norm"))
-    if not clips_rewards(config) and returns.reward_reached > 1.0:
-        remedies.append(Remedy("learning.clip_rewards", True, "use learning.clip_rewards=true"))
-    return remedies
+    counted = "updates" if learning.target_update_every_updates is not None else "steps"
+    key = f"learning.target_update_every_{counted}"
+    now = learning.target_update_every_updates or learning.target_update_every_steps
+    return _lower_learning_rate(config), Remedy(key, 4 * now, f"raise {key} (now {now})")
 
 
 def _lower_learning_rate(config: ExperimentConfig) -> Remedy:

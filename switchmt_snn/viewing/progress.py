@@ -74,7 +74,7 @@ class Progress:
             self._show()
         elif isinstance(event, EpisodeEnded):
             self._returns[event.task].append(event.episode_return)
-            self._seen.add(event.episode_return, event.length_steps)
+            self._seen.add(event.episode_return)
         elif isinstance(event, Measured):
             self._loss, self._q = event.loss, event.q
             warned = health_warnings(event, self._training.config, self._seen)

@@ -99,6 +99,10 @@ def test_describe_takes_runs_and_train_says_what_to_do_with_one(capsys, tmp_path
     assert json.loads(of_a_run)["methods"] == json.loads(of_the_preset)["methods"]
     (tmp_path / "config.yaml").write_text("seed: 3\n")
     for words, told in (
+        (
+            ["describe", str(tmp_path)],
+            f"{tmp_path} is a folder without a run, expected a config (YAML file or preset), a",
+        ),
         (["describe", "pretrained/x"], "no pretrained run 'x', expected one of"),
         (["train", "pretrained/cartpole"], "pretrained/cartpole comes with the package and holds weights only"),
         (["train", str(tmp_path)], f"is a run folder, expected a config; its config is {tmp_path}/config.yaml; to"),
