@@ -137,7 +137,7 @@ def _over_time(graph: Graph, network: FoldedNetwork, weights: dict[str, Weights]
         network.constant_input
     ):  # the first layer's current is the same at every step: computed once, seen from within the Scan
         current = export_synapses(graph, layers[0].synapses, weights[layers[0].name], encoded)
-        steps = graph.constant("steps", np.arange(timesteps), np.int64)
+        steps = "" if unroll else graph.constant("steps", np.arange(timesteps), np.int64)  # what a Scan goes over
         batch_of, batch_axis = current, 0
     else:
         current, steps, batch_of, batch_axis = "", encoded, encoded, 1

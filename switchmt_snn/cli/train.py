@@ -114,8 +114,8 @@ def _say_what_next(console: Console, config: ExperimentConfig, result: RunResult
     if needed is not None and config.total_steps < needed:
         lines.append(
             f"This run is far too short to learn {', '.join(config.tasks.names)} (fewer than {needed:,} steps). What "
-            "learns: 'switchmt-snn train cartpole' (a minute), 'switchmt-snn train minatar' on a CPU (about 20 "
-            "minutes; scores: results/minatar/README.md; extra: minatar); 'switchmt-snn train paper' is for a GPU."
+            "learns: 'switchmt-snn train cartpole' (one or two minutes), 'switchmt-snn train minatar' on a CPU (about "
+            "20 minutes; scores: results/minatar/README.md; extra: minatar); 'switchmt-snn train paper' is for a GPU."
         )
     run, best = shlex.quote(str(path)), RunFolder(path).checkpoints().best()
     if best is not None and best.step != step:

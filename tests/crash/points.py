@@ -117,6 +117,7 @@ def run_forked(argv: list[str], folder: Path, begin: Callable[[int], Callable[[]
             import traceback
 
             traceback.print_exc()
+            sys.stderr.flush()
             os._exit(70)
     os.close(writing)
     with os.fdopen(reading) as stream:

@@ -30,6 +30,8 @@ def test_an_unrolled_file_is_bitwise_the_file_with_scan(variant: str) -> None:
     network, x, tasks = fold_agent(agent), observations(agent, 9), np.arange(9) % 3
     for folded, task in ((network, None), (network, 1), (quantized(network), None)):
         model = decision_model(folded, task, unroll=True)
+        used = {name for node in model.graph.node for name in node.input}
+        assert {one.name for one in model.graph.initializer} <= used, "onnxruntime warns of what no node takes"
         assert "Scan" not in {node.op_type for node in model.graph.node}
         with_scan = decision_model(folded, task)
         encoded = encode(agent.suite, agent.config, x, 0)

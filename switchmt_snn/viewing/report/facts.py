@@ -147,7 +147,7 @@ def _warnings(run: Sources) -> list[dict[str, Any]]:
     following = next(episodes, None)
     for measured in run.history.measured:
         while following is not None and following.step <= measured.step:
-            returns.add(following.episode_return, following.length_steps)
+            returns.add(following.episode_return)
             following = next(episodes, None)
         for name, warned in health_warnings(measured, run.config, returns).items():
             one = found.setdefault(name, {"name": name, "first_step": measured.step, "times": 0})
