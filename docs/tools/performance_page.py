@@ -119,8 +119,8 @@ def update_part(update: dict[str, Any]) -> list[str]:
         "not measure one.",
         "",
         "The native parts are built once per machine, in about 7 s. `torch.compile` takes 20 to 35 s at every start.",
-        "Therefore `auto` takes native for vectors, and for the 84x84 network if the processor has AVX-512 or updates",
-        "are in bfloat16.",
+        "Therefore `auto` takes native for long runs on vectors, and for the 84x84 network if the processor has",
+        "AVX-512 or updates are in bfloat16.",
         "It compiles other runs of 150,000 updates or more. Scores with bfloat16:",
         "[results/minatar](../results/minatar/README.md).",
     ]

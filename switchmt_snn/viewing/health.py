@@ -159,7 +159,7 @@ def _normalization(layer: str, network: NetworkConfig) -> list[Remedy]:
 
 
 def _for_large_values(config: ExperimentConfig) -> tuple[Remedy, ...]:
-    """What slows the targets. Huber's loss and clipped gradients do not: Adam divides gradients by their size."""
+    """What slows the targets. Smaller gradients (Huber's loss, clipping) do not: Adam divides them by their size."""
     learning = config.learning
     counted = "updates" if learning.target_update_every_updates is not None else "steps"
     key = f"learning.target_update_every_{counted}"
