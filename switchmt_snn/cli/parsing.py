@@ -200,7 +200,7 @@ def _without(argv: list[str], flag: str) -> list[str]:
 
 
 def for_named_tasks(config: ExperimentConfig, argv: list[str]) -> ExperimentConfig:
-    """A config without its returns by task if flags name other tasks: they would end the training of those.
+    """A config without its settings by task if flags name other tasks: they were chosen for its own.
 
     Args:
         config: that flags will change.
@@ -217,6 +217,7 @@ def for_named_tasks(config: ExperimentConfig, argv: list[str]) -> ExperimentConf
         return config
     return replace(
         config,
+        learning=replace(config.learning, longest_random_action_steps_by_task=()),
         evaluation=replace(config.evaluation, stop_at_returns=()),
         switching=replace(config.switching, reference_scores=(), floor_scores=()),
     )

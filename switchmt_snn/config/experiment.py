@@ -76,6 +76,13 @@ class ExperimentConfig:
             list(goals),
             f"a return for each of {list(names)}, or none",
         )
+        by_task = self.learning.longest_random_action_steps_by_task
+        require(
+            len(by_task) in (0, len(names)),
+            "learning.longest_random_action_steps_by_task",
+            list(by_task),
+            f"a number of steps for each of {list(names)}, or none",
+        )
         stack = resolved_frame_stack(self.tasks)
         per_env = self.learning.replay_capacity_steps // self.tasks.num_envs
         require(

@@ -105,6 +105,9 @@ class LearningConfig:
     longest_random_action_steps: int = 1
     """A random action is kept for n steps, with probability proportional to 1/n^2, at most so many. Epsilon is then the
     probability of beginning one. 1: one step (paper). 100 finds rewards that need a held action (Enduro)."""
+    longest_random_action_steps_by_task: tuple[int, ...] = ()
+    """``longest_random_action_steps`` of each task, in the order of tasks.names; empty: the same for all. Held actions
+    find rewards in one game and none in another."""
 
     def __post_init__(self) -> None:
         check_fields(self, "learning")
@@ -130,6 +133,9 @@ class LearningConfig:
         ):
             value = getattr(self, name)
             require(value is None or value >= 1, f"learning.{name}", value, "at least 1")
+        by_task = self.longest_random_action_steps_by_task
+        key = "learning.longest_random_action_steps_by_task"
+        require(min(by_task, default=1) >= 1, key, list(by_task), "at least 1")
         require(
             self.batch_size <= self.replay_capacity_steps,
             "learning.batch_size",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ EXPONENT = 2.0
 
 
 class Exploration(Stateful):
-    """Epsilon-greedy; with ``longest_steps`` above 1 temporally extended, as in Dabney et al. 2021 (arXiv 2006.01782).
+    """Epsilon-greedy; temporally extended where a longest is above 1, as in Dabney et al. 2021 (arXiv 2006.01782).
 
     A copy that begins to explore, which happens with probability epsilon, keeps one random action for a number of steps
     drawn from a zeta distribution. Held actions reach what independent ones do not: in Enduro, 5,200 steps of random
@@ -26,17 +27,17 @@ class Exploration(Stateful):
     """
 
     SAVED: ClassVar[tuple[str, ...]] = ("left_KN", "actions_KN")
-    DERIVED: ClassVar[tuple[str, ...]] = ("longest_steps",)
+    DERIVED: ClassVar[tuple[str, ...]] = ("longest_K_steps",)
 
-    def __init__(self, num_tasks: int, num_envs: int, longest_steps: int) -> None:
+    def __init__(self, longest_K_steps: Sequence[int], num_envs: int) -> None:
         """Nothing is held yet.
 
         Args:
-            num_tasks: K.
+            longest_K_steps: of each task, how long a random action lasts at most.
             num_envs: copies of a task, N.
-            longest_steps: ``learning.longest_random_action_steps``.
         """
-        self.longest_steps = longest_steps
+        self.longest_K_steps = tuple(longest_K_steps)
+        num_tasks = len(self.longest_K_steps)
         self.left_KN = np.zeros((num_tasks, num_envs), np.int64)
         self.actions_KN = np.zeros((num_tasks, num_envs), np.int64)
 
@@ -54,9 +55,10 @@ class Exploration(Stateful):
         num_envs = self.left_KN.shape[1]
         begins = rng.random(num_envs) < epsilon
         actions = valid[rng.integers(0, len(valid), num_envs)]
-        if self.longest_steps == 1:
+        longest_steps = self.longest_K_steps[task]
+        if longest_steps == 1:
             return begins, actions
-        durations = np.minimum(rng.zipf(EXPONENT, num_envs), self.longest_steps)
+        durations = np.minimum(rng.zipf(EXPONENT, num_envs), longest_steps)
         left, kept = self.left_KN[task], self.actions_KN[task]
         begins &= left == 0
         left[begins], kept[begins] = durations[begins], actions[begins]

@@ -113,9 +113,9 @@ def require_sound(training: Training, plays: Any) -> None:
     """
     _require_counts(training)
     valid_KA = training.suite.valid_actions_KA
-    held, longest = training.exploration.left_KN, training.exploration.longest_steps
-    if (held < 0).any() or (held > longest).any():
-        raise _unlike("held random actions", held.tolist(), f"from 0 to {longest} steps")
+    held, longest = training.exploration.left_KN, training.exploration.longest_K_steps
+    if (held < 0).any() or (held > np.asarray(longest)[:, None]).any():
+        raise _unlike("held random actions", held.tolist(), f"from 0 to {list(longest)} steps")
     for task, replay in enumerate(training.replays):
         held_N = training.exploration.actions_KN[task][held[task] > 0]
         _require_actions(held_N, valid_KA[task], "the held random actions")

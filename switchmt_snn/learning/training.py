@@ -100,7 +100,9 @@ class Training(Stateful):
         self.episodes_by_task = [0] * num_tasks  # episodes that ended
         self.starts_by_task = [0] * num_tasks  # episodes that began; numbers their seeds
         self.explore_rng = np.random.default_rng(seeds[1])
-        self.exploration = Exploration(num_tasks, self.num_envs, config.learning.longest_random_action_steps)
+        longest_steps = config.learning.longest_random_action_steps
+        longest_K_steps = config.learning.longest_random_action_steps_by_task or (longest_steps,) * num_tasks
+        self.exploration = Exploration(longest_K_steps, self.num_envs)
         self.sample_rng = np.random.default_rng(seeds[2])
         self.update_clock = Every(config.learning.update_every_steps)
         learning = config.learning
@@ -384,7 +386,7 @@ class Training(Stateful):
             "return_scales": [],
             "updates_in_visit": 0,
         }  # what states of older versions lack, and do not use
-        if self.exploration.longest_steps == 1:
+        if max(self.exploration.longest_K_steps) == 1:
             older["exploration"] = self.exploration.state_dict()
         super().load_state_dict({**older, **state})
         require_sound(self, state["plays"])

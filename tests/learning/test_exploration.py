@@ -26,7 +26,7 @@ def training(**learning: Any) -> Training:
 def test_of_one_step_it_draws_what_it_has_always_drawn() -> None:
     """The golden runs rest on it."""
     ours, theirs = np.random.default_rng(3), np.random.default_rng(3)
-    part = Exploration(1, 6, 1)
+    part = Exploration([1], 6)
     for _ in range(50):
         explores, actions = part.choose(0, VALID, 0.3, ours)
         assert np.array_equal(explores, theirs.random(6) < 0.3)
@@ -34,7 +34,7 @@ def test_of_one_step_it_draws_what_it_has_always_drawn() -> None:
 
 
 def chosen(longest: int, epsilon: float, steps: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    part, rng = Exploration(2, 4, longest), np.random.default_rng(1)
+    part, rng = Exploration([1, longest], 4), np.random.default_rng(1)
     explores, actions = zip(*(part.choose(1, VALID, epsilon, rng) for _ in range(steps)), strict=True)
     return np.stack(explores), np.stack(actions)
 
@@ -42,7 +42,7 @@ def chosen(longest: int, epsilon: float, steps: int) -> tuple[np.ndarray[Any, An
 @pytest.mark.slow
 def test_durations_follow_the_zeta_distribution() -> None:
     """With epsilon 1 an action begins when the last one ends; equal neighbours are rare with many actions."""
-    part, rng = Exploration(1, 1, 20), np.random.default_rng(0)
+    part, rng = Exploration([20], 1), np.random.default_rng(0)
     many = np.arange(10_000)
     explores, actions = zip(*(part.choose(0, many, 1.0, rng) for _ in range(60_000)), strict=True)
     assert np.stack(explores).all()
@@ -67,7 +67,7 @@ def test_epsilon_is_the_probability_of_beginning() -> None:
 
 
 def test_copies_and_tasks_are_held_apart_and_an_episodes_end_ends_it() -> None:
-    part = Exploration(2, 3, 1000)
+    part = Exploration([1000, 1000], 3)
     part.left_KN[0], part.actions_KN[0] = [5, 0, 2], [3, 0, 5]
     rng = np.random.default_rng(0)
     explores, actions = part.choose(0, VALID, 0.0, rng)
@@ -95,6 +95,36 @@ def test_an_episodes_end_in_training_ends_it() -> None:
 @pytest.mark.slow
 def test_a_run_continues_exactly() -> None:
     assert_continues_exactly(lambda: training(longest_random_action_steps=30), at_steps=(61, 155))
+
+
+def test_each_task_has_its_own_longest() -> None:
+    """A task of one step draws as if no other lasted."""
+    part, rng, alone = Exploration([1, 50], 4), np.random.default_rng(5), np.random.default_rng(5)
+    for _ in range(30):
+        explores, actions = part.choose(0, VALID, 0.5, rng)
+        assert np.array_equal(explores, alone.random(4) < 0.5)
+        assert np.array_equal(actions, VALID[alone.integers(0, 4, 4)])
+    longest = max(int(part.left_KN[1].max()) for _ in range(200) if part.choose(1, VALID, 1.0, rng)[0].all())
+    assert 2 <= longest < 50
+    assert not part.left_KN[0].any()
+
+
+def test_training_gives_each_task_its_own_longest() -> None:
+    assert training(longest_random_action_steps=9).exploration.longest_K_steps == (9, 9)
+    by_task = training(longest_random_action_steps=9, longest_random_action_steps_by_task=(1, 30))
+    assert by_task.exploration.longest_K_steps == (1, 30)
+
+
+@pytest.mark.parametrize(
+    ("by_task", "says"),
+    [
+        ((0, 3), r"learning\.longest_random_action_steps_by_task is \[0, 3\], expected at least 1"),
+        ((3,), r"learning\.longest_random_action_steps_by_task is \[3\], expected a number of steps for each of"),
+    ],
+)
+def test_steps_by_task_that_fit_no_tasks_are_refused(by_task: tuple[int, ...], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        small_config(learning={"longest_random_action_steps_by_task": by_task})
 
 
 def test_less_than_one_step_is_refused() -> None:
