@@ -32,6 +32,7 @@ ARGUMENTS = {
         "RUN",
         "run folders or pretrained/NAME; several are compared (default: the run that was begun last)",
     ),
+    "compare": ("RUN", "two or more run folders or pretrained/NAME"),
     "study": ("CONFIG", "a YAML file (docs/studies.md), a study that comes with the package, or a study's folder"),
     "replay-policies": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "runs": ("FOLDER", "a folder with run folders, or one run folder (default: runs/)"),

@@ -26,13 +26,16 @@ class ReportOptions:
 def command(argv: list[str]) -> int:
     """Run the command; returns its exit code."""
     names, rest = split(ReportOptions, argv, "report", ReportOptions())
-    options = parse(ReportOptions, rest, "report", ReportOptions())
+    return write_page([*names] or [None], parse(ReportOptions, rest, "report", ReportOptions()))
+
+
+def write_page(names: list[str | None], options: ReportOptions) -> int:
+    """Write the page of runs, and say where it is; None is the newest run."""
     from switchmt_snn.runs.packing import open_run
     from switchmt_snn.viewing.progress_bar import ProgressBars
     from switchmt_snn.viewing.report.page import write_report
 
-    chosen: list[str | None] = [*names] or [None]  # None is the newest run
-    found = [open_run(name).path for name in chosen]
+    found = [open_run(name).path for name in names]
     runs = [open_run(path, to_write=True).path for path in found]
     with ProgressBars():
         page = write_report(runs, options.out, options.figures)

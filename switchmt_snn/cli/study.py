@@ -57,24 +57,16 @@ def command(argv: list[str]) -> int:
     options = parse(StudyOptions, rest, "study", StudyOptions())
     if "--seeds" in rest and not options.seeds:  # an empty list would silently be the file's
         raise ConfigError("study got --seeds without a number, expected seeds, as in --seeds 1 2 3")
-    from switchmt_snn.study.folder import STUDIES, StudyFolder
-    from switchmt_snn.study.grid import load_study, studies
+    from switchmt_snn.study.grid import studies
 
     if source is None:
         raise ConfigError(f"study got no CONFIG, expected a YAML file or one of {', '.join(studies())}")
-    if StudyFolder(Path(source)).is_study:
-        if options.folder is not None or options.seeds or options.set:
-            raise ConfigError(
-                f"study got the folder {source} and --folder, --seeds or --set, expected the folder alone, or CONFIG"
-            )
-        folder = StudyFolder(Path(source))
-        study = folder.study()
-    else:
-        study = load_study(source, options.set, options.seeds)
-        folder = StudyFolder(options.folder or STUDIES / study.name)
+    study, folder = _named(source, options)
     console = output.console(stderr=options.json)
     if sum((options.dry_run, options.status, options.report)) > 1:
         raise ConfigError("study got several of --dry-run, --status and --report, expected one of them")
+    if options.status or options.report or (options.dry_run and folder.is_study):
+        folder.require_same(study)
     if options.status:
         return _status(console, study, folder, options.json)
     if options.engine != "ray":
@@ -84,10 +76,25 @@ def command(argv: list[str]) -> int:
     if options.dry_run:
         return _dry_run(console, study, folder, options)
     if options.report:
-        folder.require()
         _report(console, study, folder, options.json)
         return 0
     return _run(console, study, folder, options)
+
+
+def _named(source: str, options: StudyOptions) -> tuple[Study, StudyFolder]:
+    """The study of a folder, or of a file and its folder."""
+    from switchmt_snn.study.folder import STUDIES, StudyFolder
+    from switchmt_snn.study.grid import load_study
+
+    if StudyFolder(Path(source)).is_study:
+        if options.folder is not None or options.seeds or options.set:
+            raise ConfigError(
+                f"study got the folder {source} and --folder, --seeds or --set, expected the folder alone, or CONFIG"
+            )
+        folder = StudyFolder(Path(source))
+        return folder.study(), folder
+    study = load_study(source, options.set, options.seeds)
+    return study, StudyFolder(options.folder or STUDIES / study.name)
 
 
 def _status(console: Console, study: Study, folder: StudyFolder, as_json: bool) -> int:
@@ -122,17 +129,14 @@ def _dry_run(console: Console, study: Study, folder: StudyFolder, options: Study
 
 
 def _report(console: Console, study: Study, folder: StudyFolder, as_json: bool) -> None:
-    """The report of what has finished; a study that trained well does not fail because its page cannot be written."""
+    """The report of what has finished.
+
+    Raises:
+        RunFolderError: no trial has finished, or something cannot be read or written.
+    """
     from switchmt_snn.study.report import write_study_report
 
-    try:
-        page = write_study_report(study, folder)
-    except SwitchMTError as error:
-        console.print(f"no report: {error}", highlight=False, soft_wrap=True)
-        return
-    if page is None:
-        console.print("no report: no trial has finished", highlight=False)
-        return
+    page = write_study_report(study, folder)
     console.print(f"tables: {folder.path / 'tables.md'}; report: {page}", highlight=False, soft_wrap=True)
     if as_json:
         output.print_json((folder.path / "study.json").read_text("utf-8"))
@@ -162,7 +166,10 @@ def _run(console: Console, study: Study, folder: StudyFolder, options: StudyOpti
         with stop_requests() as requested:
             failed = run_trials(waiting, folder, jobs, engine, screen, requested)
             stopped = requested()
-        _report(console, study, folder, options.json)
+        try:
+            _report(console, study, folder, options.json)
+        except SwitchMTError as error:  # trials that trained well do not fail because their page cannot be written
+            console.print(f"no report: {error}", highlight=False, soft_wrap=True)
     finally:
         lock.release()
     _say_how_to_go_on(console, how_to_go_on(folder.path, options), stopped, [trial.name for trial in failed])

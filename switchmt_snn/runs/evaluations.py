@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,31 @@ def evaluation_name(evaluation: Evaluation) -> str:
     tasks = file_name(*sorted({row.task for row in evaluation.tasks}))
     played = f"n{protocol.episodes}_seed{protocol.seed}_epsilon{exact(protocol.epsilon)}_envs{protocol.num_envs}"
     statistics = f"_statistics{protocol.statistics_batches}" if protocol.statistics_batches else ""
-    return f"{_step_name(evaluation.step)}_{tasks}_{played}{statistics}"
+    longest = protocol.max_episode_steps
+    cut = "" if longest == EvaluationConfig.max_episode_steps else f"_longest{longest}"
+    return f"{_step_name(evaluation.step)}_{tasks}_{played}{cut}{statistics}"
+
+
+def played_as(
+    evaluations: Iterable[dict[str, Any]], asked: EvaluationConfig, seed: int | None = None
+) -> list[dict[str, Any]]:
+    """The stored evaluations that were played as a config asks; what older files do not state counts as asked.
+
+    The number of copies changes no score but by rounding: those with the asked one come last.
+
+    Args:
+        evaluations: summaries.
+        asked: the settings.
+        seed: in place of theirs.
+    """
+    wanted = {
+        "episodes": asked.episodes,
+        "epsilon": asked.epsilon,
+        "seed": asked.seed if seed is None else seed,
+        "max_episode_steps": asked.max_episode_steps,
+    }
+    fitting = [one for one in evaluations if all(one["protocol"].get(key, v) == v for key, v in wanted.items())]
+    return sorted(fitting, key=lambda one: one["protocol"].get("num_envs") == min(asked.num_envs, asked.episodes))
 
 
 class Evaluations:
@@ -55,16 +79,14 @@ class Evaluations:
         return path
 
     def mean_returns(self, step: int, settings: EvaluationConfig) -> dict[str, float]:
-        """Mean return of the agent by task, from evaluations of this step's weights with these episodes and epsilon."""
+        """Mean return of the agent by task, from evaluations of this step's weights with these settings."""
         means: dict[str, float] = {}
-        asked = (settings.episodes, settings.seed, settings.epsilon)
-        for stored in self._at(step):
-            if tuple(stored["protocol"][key] for key in ("episodes", "seed", "epsilon")) == asked:
-                means |= {row["task"]: row["mean"] for row in stored["tasks"] if row["policy"] == "agent"}
+        for stored in played_as(self._at(step), settings):
+            means |= {row["task"]: row["mean"] for row in stored["tasks"] if row["policy"] == "agent"}
         return means
 
     def best_known(self, step: int, task: str) -> dict[str, Any] | None:
-        """What this step's weights are worth in a task: the evaluation with the most episodes; of equals the last name.
+        """What this step's weights are worth in a task: of its evaluations that of most weight.
 
         Returns:
             ``episodes``, ``score``, ``random_score``, ``better_than_random`` (None if standard errors are missing),
@@ -74,9 +96,11 @@ class Evaluations:
             RunFolderError: a file is no evaluation.
         """
         found: dict[str, Any] | None = None
+        best = (0, 0)
         for stored in self._at(step):
             rows = {row["policy"]: row for row in stored["tasks"] if row["task"] == task}
-            if "agent" in rows and (found is None or rows["agent"]["episodes"] >= found["episodes"]):
+            if "agent" in rows and (weight := weight_of(stored, rows["agent"])) >= best:
+                best = weight
                 found = {
                     "episodes": rows["agent"]["episodes"],
                     "score": rows["agent"]["mean"],
@@ -98,6 +122,11 @@ class Evaluations:
     def _at(self, step: int) -> list[dict[str, Any]]:
         """The stored summaries of a step, in order of their names."""
         return [_read(path) for path in sorted(self.folder.glob(f"{_step_name(step)}_*.json"))]
+
+
+def weight_of(stored: Mapping[str, Any], row: Mapping[str, Any]) -> tuple[int, int]:
+    """By which of two evaluations of the same weights is shown: the episodes, and how long they may last."""
+    return int(row["episodes"]), EvaluationProtocol.from_dict(stored["protocol"]).max_episode_steps
 
 
 def better_than_random(stored: Mapping[str, Any], task: str) -> bool | None:

@@ -11,6 +11,7 @@ from typing import Any
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import RunFolderError, SwitchMTError, reason_of
 from switchmt_snn.machine.progress import progress_of
+from switchmt_snn.runs.evaluations import played_as, weight_of
 from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, read_history
 
@@ -159,24 +160,24 @@ def run_status(folder: RunFolder, config: ExperimentConfig, steps: int, evaluati
         return "running"
     # A run that evaluation.stop_at_returns ended has an evaluation with the seed after that of those during training.
     solved = config.evaluation.stop_at_returns and any(
-        one["step"] == steps and one["protocol"].get("seed") == config.evaluation.seed + 1 for one in evaluations
+        one["step"] == steps for one in played_as(evaluations, config.evaluation, config.evaluation.seed + 1)
     )
     return "finished" if solved or steps >= config.total_steps else "stopped"
 
 
 def newest_scores(history: History, evaluations: Sequence[dict[str, Any]]) -> tuple[Score, ...]:
-    """For each task its newest evaluation (of equals the one with the most episodes), else its newest returns."""
+    """For each task its newest evaluation (of equals that of most weight, ``weight_of``), else its newest returns."""
     scores = []
     for index, task in enumerate(history.task_names):
         played = [
-            (one["step"], row["episodes"], row["mean"])
+            (one["step"], weight_of(one, row), row["mean"])
             for one in evaluations
             for row in one["tasks"]
             if (row["policy"], row["task"]) == ("agent", task)
         ]
         returns = [one.episode_return for one in history.episodes if one.task == index][-RETURN_WINDOW_EPISODES:]
         if played:
-            _, episodes, mean = max(played)
+            _, (episodes, _), mean = max(played)
             scores.append(Score(task, mean, episodes, "evaluation"))
         elif returns:
             scores.append(Score(task, sum(returns) / len(returns), len(returns), "training"))

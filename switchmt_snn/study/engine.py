@@ -12,6 +12,7 @@ from typing import Protocol
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.study.folder import Attempt, StudyFolder, TrialRun, moment
 from switchmt_snn.study.grid import Trial
+from switchmt_snn.study.processes import BEGINS
 
 ATTEMPTS = 2
 """Of a trial in one call: a trial that fails is tried once more."""
@@ -157,11 +158,12 @@ def training_words(trial: Trial, folder: StudyFolder) -> list[str]:
 
 
 def last_words(log: Path) -> str:
-    """The last line of a trial's log that says something."""
+    """The last line that a trial's newest process printed; what to know if it printed none."""
     try:
         with log.open("rb") as stream:
             stream.seek(max(0, stream.seek(0, 2) - 8_192))
             lines = stream.read().decode("utf-8", "replace").splitlines()
     except OSError:
-        return ""
-    return next((line.strip() for line in reversed(lines) if line.strip()), "")
+        lines = []
+    said = next((line.strip() for line in reversed(lines) if line.strip()), BEGINS)
+    return "it printed nothing" if said == BEGINS else said

@@ -1,7 +1,7 @@
 """The folder of a study, and how far its trials are.
 
-study.yaml  trials.json  configs/NAME.yaml  trials/NAME/ (run folders)  logs/NAME.log  attempts.jsonl
-and what the report writes: tables.md  study.json  trials.csv  scores.csv  decisions.csv  report.html
+trials.json  configs/NAME.yaml  trials/NAME/ (run folders)  logs/NAME.log  attempts.jsonl
+and what the report writes: tables.md  study.json  trials.csv  scores.csv  curves.csv  report.html  report.json
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import filelock
 from switchmt_snn.config import ExperimentConfig, differences, load_config, to_dict, to_yaml
 from switchmt_snn.config.trust import SIGNATURE, allow, is_signed, modules_in, require_trusted, signature_of
 from switchmt_snn.errors import ConfigError, RunFolderError, SwitchMTError
+from switchmt_snn.runs.evaluations import played_as
 from switchmt_snn.runs.files import json_text, parsed_json, write_atomically, writing
 from switchmt_snn.runs.folder import RunFolder, locked
 from switchmt_snn.study.grid import Study, Trial, folder_name
@@ -107,7 +108,7 @@ class StudyFolder:
         with writing(self.path, "--folder"):
             self.path.mkdir(parents=True, exist_ok=True)
             if self.is_study:
-                self._require_same(study)
+                self.require_same(study)
             else:
                 stranger = next((one.name for one in self.path.iterdir() if one.name not in _BEGINNING), None)
                 if stranger is not None:
@@ -123,7 +124,14 @@ class StudyFolder:
                     write_atomically(self.config(trial), text)
             write_atomically(self.path / "trials.json", json_text(_listed(study), indent=1).encode())
 
-    def _require_same(self, study: Study) -> None:
+    def require_same(self, study: Study) -> None:
+        """Refuse a study that is not the one in this folder; trials may be added.
+
+        Raises:
+            ConfigError: a trial that is here has another config, or is not in the study.
+            RunFolderError: there is no study here, or its trials.json cannot be read.
+        """
+        self.require()
         known = {trial.name: trial for trial in study.trials}
         with self._reading_trials() as listing:
             stored = [folder_name(one["name"]) for one in listing["trials"]]
@@ -303,11 +311,9 @@ class TrialRun:
         if last < config.total_steps and not evaluation.stop_at_returns:
             return None
         seed = evaluation.seed if last >= config.total_steps else evaluation.seed + 1
-        for one in reversed(self.folder.evaluations.all()):
-            played = tuple(one["protocol"].get(key) for key in ("episodes", "epsilon", "seed"))
+        for one in reversed(played_as(self.folder.evaluations.all(), evaluation, seed)):
             tasks = {row["task"] for row in one["tasks"] if row["policy"] == "agent"}
-            asked = (evaluation.episodes, evaluation.epsilon, seed)
-            if one["step"] == last and played == asked and tasks == set(config.tasks.names):
+            if one["step"] == last and tasks == set(config.tasks.names):
                 return dict(one)
         return None
 

@@ -279,7 +279,7 @@ def _variants(file: StudyFile, where: str) -> dict[str, dict[str, Any]]:
     short = _short_keys(grid)
     found: dict[str, dict[str, Any]] = {}
     for own, settings in named.items():
-        if own != "":
+        if file.variants:
             _require_name(own, f"{where}: variants")
         fixed = _settings(settings, f"{where}: variant {own}")
         for key in fixed:
@@ -344,8 +344,8 @@ def _references(file: StudyFile, variants: dict[str, ExperimentConfig]) -> dict[
             require(plays, f"references.{task}", value, "a number, or a variant that plays this task")
             found[task] = value
         else:
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            require(number, f"references.{task}", value, "a number, or a variant that plays this task")
+            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+            require(number, f"references.{task}", value, "a finite number, or a variant that plays this task")
             found[task] = float(value)
     return found
 

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from switchmt_snn.runs.files import writing
 
+BEGINS = "--- a process begins"
+"""The line of a log before what each process says: the last words of one are not those of an earlier one."""
 _PR_SET_PDEATHSIG = 1  # prctl.h of Linux
 _PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None  # found here: the new process only calls it
 
@@ -30,6 +32,8 @@ class ProgramProcess:
         """
         own = {} if python_path is None else {"PYTHONPATH": python_path}
         with writing(log), log.open("ab") as stream:
+            stream.write(f"{BEGINS}\n".encode())
+            stream.flush()
             self.process = subprocess.Popen(
                 _command_of(words),
                 stdin=subprocess.DEVNULL,

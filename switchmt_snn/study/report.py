@@ -9,30 +9,32 @@ from pathlib import Path
 from typing import Any
 
 from switchmt_snn.config.numbers import exact
+from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.files import json_text, write_atomically
 from switchmt_snn.study.figures import study_figures
 from switchmt_snn.study.folder import StudyFolder
 from switchmt_snn.study.grid import Study
 from switchmt_snn.study.results import TrialResult, read_results
-from switchmt_snn.study.tables import Results, Table, references_of, study_tables
+from switchmt_snn.study.tables import Results, Table, references_of, study_tables, why_no_shares
 from switchmt_snn.viewing.report.page import write_comparison
 
 _MOST_NAMED = 10
 """Unfinished trials that the tables name."""
 
 
-def write_study_report(study: Study, folder: StudyFolder) -> Path | None:
+def write_study_report(study: Study, folder: StudyFolder) -> Path:
     """Write the report of the trials that have finished.
 
     Returns:
-        The path of ``report.html``; None if no trial has finished.
+        The path of ``report.html``.
 
     Raises:
-        RunFolderError: the study has not been begun, a trial's log cannot be read, or the folder cannot be written.
+        RunFolderError: the study has not been begun, no trial has finished, a trial's log cannot be read, or the folder
+            cannot be written.
     """
     results = read_results(study, folder.require())
     if not results:
-        return None
+        raise RunFolderError(f"no trial of {folder.path} has finished, expected one; train the study first")
     tables = study_tables(study, results)
     headline = _headline(study, results)
     contents = {
@@ -97,10 +99,12 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 def _headline(study: Study, results: Sequence[TrialResult]) -> str:
     finished = {one.trial.name for one in results}
     missing = [trial.name for trial in study.trials if trial.name not in finished]
+    without = why_no_shares(Results(study, results))
+    shares = "" if without is None else f" No shares of the references and no decision: {without}."
     if not missing:
-        return f"All {len(study.trials)} trials finished."
+        return f"All {len(study.trials)} trials finished.{shares}"
     named = ", ".join(missing[:_MOST_NAMED]) + (", ..." if len(missing) > _MOST_NAMED else "")
-    return f"{len(finished)} of {len(study.trials)} trials finished. Not finished: {named}."
+    return f"{len(finished)} of {len(study.trials)} trials finished. Not finished: {named}.{shares}"
 
 
 def _markdown(study: Study, headline: str, tables: Sequence[Table]) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from switchmt_snn.acting.evaluation import EvaluationProtocol
+from switchmt_snn.runs.evaluations import played_as
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.study.folder import StudyFolder, TrialRun
 from switchmt_snn.study.grid import Study, Trial
@@ -131,13 +132,10 @@ def _updates_at(counted: Sequence[tuple[int, int]], step: int) -> int:
 
 def _curve(run: Sources, final: dict[str, Any], task: str) -> tuple[tuple[int, float], ...]:
     """Evaluations during training, and the final one."""
-    asked = run.config.evaluation
-    wanted = (asked.episodes, asked.epsilon, asked.seed)
     points = {}
-    for one in run.evaluations:
-        played = tuple(one["protocol"].get(key) for key in ("episodes", "epsilon", "seed"))
+    for one in played_as(run.evaluations, run.config.evaluation):
         mean = _mean(one, task)
-        if played == wanted and mean is not None and one["step"] < final["step"]:
+        if mean is not None and one["step"] < final["step"]:
             points[int(one["step"])] = mean
     last = _mean(final, task)
     return tuple(sorted(points.items())) + (() if last is None else ((int(final["step"]), last),))
@@ -148,7 +146,7 @@ def _reestimated(evaluations: Sequence[dict[str, Any]], final: dict[str, Any]) -
 
     Of several, the one of most batches counts.
     """
-    keys = ("episodes", "epsilon", "seed")
+    keys = ("episodes", "epsilon", "seed", "max_episode_steps")
     found: dict[str, float] = {}
     for one in sorted(evaluations, key=lambda one: int(one["protocol"].get("statistics_batches", 0))):
         same = all(one["protocol"].get(key) == final["protocol"].get(key) for key in keys)

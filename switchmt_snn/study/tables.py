@@ -143,11 +143,7 @@ def _by_task(
 
 def _scores(found: Results) -> Table:
     rows = [(name, len(found.of(name)), *_by_task(found, name, lambda row: row.mean)) for name in found.variants]
-    random = []
-    for task in found.tasks:
-        known = [row.random_mean for name in found.variants for row in found.rows(name, task)]
-        means = [mean for mean in known if mean is not None]
-        random.append(float(np.mean(means)) if means else None)
+    random = [_random_play(found, task) for task in found.tasks]
     protocols = list(dict.fromkeys(one.protocol for one in found.results))
     return Table(
         name="scores",
@@ -184,19 +180,42 @@ class Shares:
     by_variant: dict[str, Any]
 
 
+def why_no_shares(found: Results) -> str | None:
+    """Why results have no shares of their references; None if they have, or fewer than two references were named."""
+    if len(found.study.references) < 2:
+        return None
+    references = references_of(found)
+    for task, variant in found.study.references.items():
+        if task not in references:
+            return f"no trial of {variant} has finished, whose score is the reference of {found.shown(task)}"
+    if min(references.values()) > 0:
+        return None
+    for task, reference in references.items():
+        floor = _random_play(found, task)
+        if floor is None:
+            return f"random play of {found.shown(task)} was not evaluated, which counts as 0"
+        if reference <= floor:
+            return (
+                f"the reference of {found.shown(task)} is {digits(reference)}, random play, which counts as 0, scores "
+                f"{digits(floor)}"
+            )
+    return None
+
+
+def _random_play(found: Results, task: str) -> float | None:
+    """What random play scored in a task, mean over all trials; None if it was not evaluated."""
+    means = [row.random_mean for name in found.variants for row in found.rows(name, task)]
+    known = [mean for mean in means if mean is not None]
+    return float(np.mean(known)) if known else None
+
+
 def shares_of(found: Results) -> Shares | None:
-    """Shares of the references; None without at least two references that are known and above their floors."""
+    """Shares of the references; None without two or more (``why_no_shares``)."""
     references = references_of(found)
     tasks = [task for task in found.tasks if task in references]
-    if len(tasks) < 2 or len(references) < len(found.study.references):
+    if len(tasks) < 2 or why_no_shares(found) is not None:
         return None
-    floors = None
-    if min(references.values()) <= 0:
-        floors = [
-            float(np.mean([r.random_mean or 0.0 for v in found.variants for r in found.rows(v, t)])) for t in tasks
-        ]
-        if any(references[task] <= floor for task, floor in zip(tasks, floors, strict=True)):
-            return None
+    floors = [_random_play(found, task) or 0.0 for task in tasks] if min(references.values()) <= 0 else None
     shares = {}
     for name in found.variants:
         scores = found.scores(name, tasks)

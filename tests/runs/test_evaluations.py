@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from switchmt_snn.config.yaml_io import from_dict
 from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.evaluations import Evaluations
 from switchmt_snn.runs.folder import RunFolder
+from switchmt_snn.runs.listing import summarize
 
 CARTPOLE: dict[str, Any] = {
     "total_steps": 100,
@@ -40,7 +42,8 @@ def stored(run: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "change", [{"epsilon": 0.5}, {"epsilon": 0.0500001}, {"num_envs": 1}, {"seed": 3}, {"episodes": 3}]
+    "change",
+    [{"epsilon": 0.5}, {"epsilon": 0.0500001}, {"num_envs": 1}, {"seed": 3}, {"episodes": 3}, {"max_episode_steps": 5}],
 )
 def test_an_evaluation_under_another_protocol_leaves_the_others_alone(finished: Path, change: dict[str, Any]) -> None:
     before = stored(finished)
@@ -65,6 +68,22 @@ def test_a_runs_worth_is_the_evaluation_with_the_most_episodes_not_the_newest(fi
     assert known["protocol"].startswith("6 episodes per task, epsilon 0.05")
     assert evaluations.best_known(99, "CartPole-v1") is None
     assert evaluations.best_known(100, "Acrobot-v1") is None
+
+
+@pytest.mark.slow
+def test_shorter_episodes_replace_nothing_and_count_for_less(finished: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    evaluations, settings = RunFolder(run).evaluations, RunFolder(run).config().evaluation
+    before, known = evaluations.mean_returns(100, settings), evaluations.best_known(100, "CartPole-v1")
+    assert known is not None
+    scores = summarize(run).scores
+    for episodes in {settings.episodes, known["episodes"]}:
+        cut = evaluate(run, episodes=episodes, max_episode_steps=2)
+        assert cut.score("CartPole-v1").mean == 2.0
+    assert evaluations.mean_returns(100, settings) == before
+    assert evaluations.best_known(100, "CartPole-v1") == known
+    assert summarize(run).scores == scores
 
 
 @pytest.mark.slow

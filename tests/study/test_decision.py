@@ -10,7 +10,7 @@ import pytest
 from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.study.grid import Study, Trial
 from switchmt_snn.study.results import TaskResult, TrialResult
-from switchmt_snn.study.tables import Results, study_tables
+from switchmt_snn.study.tables import Results, study_tables, why_no_shares
 
 SEEDS = range(1, 7)  # with six, the smallest p is 2 / 2^6 = 0.031
 TASKS = ("easy", "own.module:Hard-v0")
@@ -56,6 +56,38 @@ def decision(study: Study, results: list[Any]) -> dict[str, list[Any]]:
 def test_a_variant_is_preferred_if_all_conditions_hold(other: list[tuple[float, float]], answers: list[str]) -> None:
     study, results = study_of({"uniform": BASE, "other": other}, REFERENCES)
     assert decision(study, results) == {"other": answers}
+
+
+@pytest.mark.parametrize(
+    ("references", "random", "why"),
+    [
+        (REFERENCES, 0.0, None),
+        ({TASKS[0]: 1.0}, 0.0, None),
+        ({TASKS[0]: 1.0, TASKS[1]: 0.0}, -0.5, None),
+        (
+            {TASKS[0]: 1.0, TASKS[1]: -1.0},
+            -0.5,
+            "the reference of Hard-v0 is -1, random play, which counts as 0, scores -0.5",
+        ),
+        (
+            {TASKS[0]: -0.5, TASKS[1]: 1.0},
+            -0.5,
+            "the reference of easy is -0.5, random play, which counts as 0, scores -0.5",
+        ),
+        ({TASKS[0]: 1.0, TASKS[1]: -1.0}, None, "random play of easy was not evaluated, which counts as 0"),
+        (
+            {TASKS[0]: 1.0, TASKS[1]: "later"},
+            0.0,
+            "no trial of later has finished, whose score is the reference of Hard-v0",
+        ),
+    ],
+)
+def test_tables_say_why_they_have_no_shares(references: dict[str, Any], random: float | None, why: str | None) -> None:
+    study, results = study_of({"uniform": BASE, "other": HIGHER}, references)
+    results = [replace(one, tasks=tuple(replace(row, random_mean=random) for row in one.tasks)) for one in results]
+    assert why_no_shares(Results(study, results)) == why
+    tables = {one.name for one in study_tables(study, results)}
+    assert ({"shares", "decision"} <= tables) == (why is None and len(references) == 2)
 
 
 def test_p_is_corrected_for_the_number_of_variants() -> None:

@@ -169,6 +169,15 @@ REFUSED = {
         "references: {CartPole-v1: b}\n",
         "references.CartPole-v1 is 'b', expected a number, or a variant that plays this task",
     ),
+    "reference that is no number": (
+        "base: cartpole\nreferences: {CartPole-v1: .nan}\n",
+        "references.CartPole-v1 is nan, expected a finite number",
+    ),
+    "endless reference": (
+        "base: cartpole\nreferences: {CartPole-v1: .inf}\n",
+        "references.CartPole-v1 is inf, expected a finite number",
+    ),
+    "no name": ("base: cartpole\nvariants: {'': {}, b: {}}\n", "variants is '', expected letters, digits"),
     "unknown baseline": ("base: cartpole\nbaseline: x\n", "baseline is 'x', expected one of mine"),
     "wrong type": ("base: cartpole\nvariants: [a]\n", "variants is ['a'], expected a mapping"),
     "endless base": (f"base: {'9' * 500}x\n", "no config file or preset '999"),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from switchmt_snn.config import to_yaml
+from switchmt_snn.errors import RunFolderError
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.study import statistics
 from switchmt_snn.study.folder import StudyFolder
@@ -154,6 +155,29 @@ def test_tables_and_page_say_what_is_missing_and_the_same_numbers(finished: tupl
     assert before == {name: (folder.path / name).read_bytes() for name in before}
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [("later", {"max_episode_steps": 50}), ("zlater", {"num_envs": 3}), ("zlater", {"epsilon": 0.9})],
+)
+def test_an_evaluation_that_was_played_otherwise_counts_for_nothing(
+    name: str, change: dict[str, Any], finished: tuple[Study, StudyFolder], tmp_path: Path
+) -> None:
+    study, folder = finished
+    copy = StudyFolder(tmp_path / "copy")
+    shutil.copytree(folder.path, copy.path)
+    for trial in study.trials[:-1]:
+        evaluations = copy.run(trial) / "evaluations"
+        for path in list(evaluations.glob("step-*.json")):
+            stored = json.loads(path.read_text())
+            stored["protocol"] |= change
+            for row in stored["tasks"]:
+                row["mean"] = 0.0
+            path.with_name(f"{path.stem}_{name}.json").write_text(json.dumps(stored))
+    write_study_report(study, copy)
+    for name in ("tables.md", "scores.csv", "curves.csv"):
+        assert (copy.path / name).read_text() == (folder.path / name).read_text()
+
+
 @pytest.mark.slow
 def test_the_page_is_sound_in_a_browser(finished: tuple[Study, StudyFolder]) -> None:
     assert_sound(finished[1].path / "report.html")
@@ -164,5 +188,6 @@ def test_a_study_without_a_finished_trial_has_no_report(tmp_path: Path) -> None:
     study, folder = Study("empty", (Trial("a_seed1", "a", 1, config),), {}, "a"), StudyFolder(tmp_path / "s")
     folder.prepare(study)
     assert read_results(study, folder) == []
-    assert write_study_report(study, folder) is None
+    with pytest.raises(RunFolderError, match=r"no trial of .* has finished, expected one"):
+        write_study_report(study, folder)
     assert to_yaml(config)

@@ -22,7 +22,8 @@ from switchmt_snn.config import load_config
 from switchmt_snn.errors import ConfigError, RunFolderError
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.run import train
-from switchmt_snn.study import local
+from switchmt_snn.study import local, processes
+from switchmt_snn.study.engine import last_words
 from switchmt_snn.study.folder import StudyFolder, TrialRun
 from switchmt_snn.study.grid import load_study
 
@@ -269,6 +270,44 @@ def test_a_folder_takes_more_trials_but_no_other_ones(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="is in use by another process, expected a free study"):
         StudyFolder(folder.path).lock()
     held.release()
+
+
+@pytest.mark.parametrize("option", ["--report", "--status", "--dry-run"])
+def test_what_only_looks_at_a_folder_takes_no_other_study(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny(tmp_path / "s.yaml", "")
+    folder = StudyFolder(tmp_path / "s")
+    folder.prepare(load_study(path))
+    for words, expected in (
+        ([], None),
+        (["--set", "learning.learning_rate=0.7"], "holds s_seed1 with another config: learning.learning_rate"),
+        (["--seeds", "2"], "holds trials that are not in the study: s_seed1, expected the same study"),
+    ):
+        if expected is None and option == "--dry-run":
+            continue  # it would train
+        with pytest.raises(SystemExit) as stop:
+            main(["study", str(path), "--folder", str(folder.path), *words, option])
+        error = capsys.readouterr().err
+        if expected is not None:
+            assert (stop.value.code, error.count("\n")) == (2, 1)
+            assert expected in error
+        elif option == "--report":
+            assert (stop.value.code, error.count("\n")) == (2, 1)
+            assert "no trial of" in error
+        else:
+            assert stop.value.code == 0
+    assert not (folder.path / "tables.md").exists()
+
+
+def test_last_words_are_those_of_the_newest_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "_command_of", lambda words: [sys.executable, "-c", *words])
+    log = tmp_path / "log"
+    assert last_words(log) == "it printed nothing"
+    for words, said in (("print('one'); print()", "one"), ("pass", "it printed nothing"), ("print('two')", "two")):
+        process = processes.ProgramProcess([words], log, 1)
+        assert process.process.wait(60) == 0
+        assert last_words(log) == said
 
 
 @pytest.mark.slow

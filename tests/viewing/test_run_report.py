@@ -229,6 +229,9 @@ def test_wrong_folders_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "file").write_text("")
     for words, said in (
         (["report", str(tmp_path / "nowhere")], "no run folder"),
+        (["compare", str(LAGGING), str(tmp_path / "nowhere")], "no run folder"),
+        (["compare", str(LAGGING)], f"compare got {LAGGING}, expected two runs or more; switchmt-snn report shows one"),
+        (["compare"], "compare got no RUN, expected two runs or more"),
         (
             ["report", str(LAGGING), "--out", str(tmp_path / "file")],
             "expected a writable folder; name another with --out",
@@ -240,6 +243,17 @@ def test_wrong_folders_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert stop.value.code == 2
         assert said in error
         assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_compare_is_the_report_of_several(tmp_path: Path) -> None:
+    pages = []
+    for command in ("report", "compare"):
+        with pytest.raises(SystemExit) as stop:
+            main([command, str(LAGGING), str(DQN), "--out", str(tmp_path / command)])
+        assert stop.value.code == 0
+        pages.append((tmp_path / command / "comparison.json").read_text().replace(f"/{command}", ""))
+    assert pages[0] == pages[1]
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from switchmt_snn.config import ExperimentConfig
 from switchmt_snn.errors import SwitchMTError
 from switchmt_snn.learning.events import EpisodeEnded
 from switchmt_snn.learning.switching.criterion import Deciding, criterion_class
+from switchmt_snn.runs.evaluations import weight_of
 from switchmt_snn.runs.folder import RunFolder, read_environment
 from switchmt_snn.runs.history import History, policy_columns, read_history
 from switchmt_snn.runs.listing import RunSummary, summary_of, when_begun
@@ -56,12 +57,12 @@ class Sources:
         return [one for one in self.history.episodes if one.task == task]
 
     def newest_evaluation(self, task: str) -> dict[str, Any] | None:
-        """The newest evaluation of a task, of equals the one with the most episodes: its rows by policy, and itself."""
-        found: tuple[tuple[int, int], dict[str, Any]] | None = None
+        """The newest evaluation of a task, of equals that of most weight: its rows by policy, and itself."""
+        found: tuple[tuple[int, tuple[int, int]], dict[str, Any]] | None = None
         for one in self.evaluations:
             rows = {row["policy"]: row for row in one["tasks"] if row["task"] == task}
             if "agent" in rows:
-                rank = (one["step"], rows["agent"]["episodes"])
+                rank = (one["step"], weight_of(one, rows["agent"]))
                 if found is None or rank >= found[0]:
                     found = rank, {**one, "rows": rows}
         return None if found is None else found[1]
