@@ -73,13 +73,14 @@ def recorded_play(
     """``decisions`` recorded decisions of a task, rounded up to whole steps of all copies.
 
     Read if ``folder`` has as many, else played and stored; the same ones either way. Played like an evaluation: greedy
-    with the run's evaluation epsilon and seed. ``go_on`` is called before every step; what it raises ends the play.
+    with the run's evaluation epsilon and seed. Tasks with code from outside are always played: nothing tells whether it
+    has changed (``TaskSuite.versioned``). ``go_on`` is called before every step; what it raises ends the play.
     """
     config = agent.config.evaluation
     path = folder / f"{file_name(task)}-step-{agent.step}.npz"
     if path.exists():
         recording = read_recording(path, task, agent.suite)
-        stale = recording.rewards is None or recording.seed != config.seed
+        stale = recording.rewards is None or recording.seed != config.seed or not agent.suite.versioned
         if len(recording.actions) >= decisions and not stale:
             return _first(recording, decisions)
     recording = play(agent, task, decisions, config.epsilon, config.seed, go_on)

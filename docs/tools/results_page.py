@@ -190,16 +190,17 @@ def _answers() -> list[str]:
         ),
         (
             "Could one be better?",
-            "Perhaps, where tasks need different numbers of steps: the first table. With reference scores that you know, "
-            f"`harmonic_gain` reached a harmonic mean of {harmonic('harmonic_gain')} and `deficit` {harmonic('deficit')} "
-            f"in {study}, `fixed_steps` {harmonic('uniform')}. Each is ahead in more than half of the pairs of seeds "
-            f"(P {chance('harmonic_gain')} and {chance('deficit')}), but such differences come by chance, too: p is "
-            f"{p_value('harmonic_gain')} and {p_value('deficit')}.",
+            "Perhaps, where tasks need different numbers of steps: the first table. With reference scores that you "
+            f"know, `harmonic_gain` reached a harmonic mean of {harmonic('harmonic_gain')} and `deficit` "
+            f"{harmonic('deficit')} in {study}, `fixed_steps` {harmonic('uniform')}. Each is ahead in more than half "
+            f"of the pairs of seeds (P {chance('harmonic_gain')} and {chance('deficit')}), but such differences come "
+            f"by chance, too: p is {p_value('harmonic_gain')} and {p_value('deficit')}.",
         ),
         (
             "Which to avoid?",
             f"Policies whose visits or windows are numbers of episodes, where episodes differ in length: {counting} in "
-            f"{study}, below `fixed_steps` in every seed (p {p_value('fixed_25')}). Bad play of CartPole has short episodes, so these policies gave it few steps.",
+            f"{study}, below `fixed_steps` in every seed (p {p_value('fixed_25')}). Bad play of CartPole has short "
+            "episodes, so these policies gave it few steps.",
         ),
         (
             "What does a wrong choice cost?",
@@ -235,9 +236,9 @@ STUDIES = {
     "unequal_tasks": """
 An easy, a medium and a hard-to-start task, episodes of 10 to 500 steps, and CartPole's left and right swapped after
 half of the steps ([the study](../configs/studies/unequal_tasks.yaml)). Every task is learned by some policy; what
-differs most is CartPole, which has to be learned twice. Eight of the study's twelve variants have been trained, with all
-ten seeds; p is corrected for these eight, and the other four could only make it larger. `deficit` and `harmonic_gain`
-are told the scores at which a task counts as solved, the others are not.
+differs most is CartPole, which has to be learned twice. Eight of the study's twelve variants have been trained, with
+all ten seeds; p is corrected for these eight, and the other four could only make it larger. `deficit` and
+`harmonic_gain` are told the scores at which a task counts as solved, the others are not.
 
 **None is preferred to `uniform`.** What the rule asks of p is missed by the two that are ahead. Three policies whose
 visits or windows are counted in episodes are worse than `uniform` in every seed.

@@ -53,6 +53,11 @@ def load_plugin(name: str, key: str) -> Any:
             f"{key} is {name!r}, expected a name that {module_name!r} defines, but it has no {attribute!r}; "
             "check the spelling"
         ) from None
+    except Exception as error:  # a module that looks its names up when they are asked for
+        raise ConfigError(
+            f"{key} is {name!r}, expected a name that {module_name!r} defines, but looking it up fails "
+            f"({failure(error)}); install what it needs, or mend it"
+        ) from error
 
 
 def import_plugin_module(module_name: str) -> ModuleType:

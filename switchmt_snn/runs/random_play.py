@@ -97,6 +97,7 @@ def _facts(config: ExperimentConfig, protocol: EvaluationProtocol) -> dict[str, 
         "versions": {name: _version(name) for name in ("switchmt-snn", "numpy", *suite.packages)},
         "python": platform.python_version(),
         "processor": processor(),
+        "registered": suite.registered,
         "files_sha256": {name: sha256(path.read_bytes()) for name, path in suite.files.items()},
         "code_sha256": hashlib.sha256(b"".join(path.read_bytes() for path in code)).hexdigest(),
     }

@@ -18,8 +18,8 @@ from switchmt_snn.config.suites import SUITE_DEFAULTS
 from switchmt_snn.errors import TaskError
 from switchmt_snn.tasks.changing import all_names
 from switchmt_snn.tasks.contract import gymnasium_code
-from switchmt_snn.tasks.gym_copies import GymCopies, GymCopy, first_action, is_outside
-from switchmt_snn.tasks.gym_make import make_environment, parse_id
+from switchmt_snn.tasks.gym_copies import Env, GymCopies, GymCopy, first_action, is_inside, is_outside
+from switchmt_snn.tasks.gym_make import make_environment, parse_id, spec_of
 from switchmt_snn.tasks.gym_processes import GymProcesses
 from switchmt_snn.tasks.gym_spaces import FrameLayout, frame_layout, num_actions
 from switchmt_snn.tasks.suite import Suite, TaskEnvironment, TaskSuite
@@ -49,6 +49,11 @@ class GymSuite(Suite):
         files = {module: getattr(import_plugin_module(module), "__file__", None) for module in named}
         return {module: Path(file) for module, file in files.items() if file is not None}  # a built-in one has none
 
+    @property
+    def registered(self) -> dict[str, str]:
+        """How each id is registered now: its class, arguments, limit of steps and wrappers."""
+        return {name: repr(spec_of(parse_id(name)[1])) for name in all_names(self.config)}
+
     def make(self) -> TaskSuite:
         """Make the environments.
 
@@ -64,7 +69,12 @@ class GymSuite(Suite):
             for name, env in zip(names, probes, strict=True)
         ]
         first_actions = tuple(first_action(env) for env in probes)
-        is_gymnasiums = not any(is_outside(env) for env in probes)
+        wrapped_outside = any(not is_inside(name.partition(":")[0]) for name in wrappers if is_plugin(name))
+        outside = [
+            wrapped_outside or is_outside(env) or not is_inside(parse_id(name)[0] or "gymnasium")
+            for name, env in zip(names, probes, strict=True)
+        ]
+        _require_different(names, probes)
         for name, env in zip(names, probes, strict=True):
             with gymnasium_code(name, "close"):
                 env.close()
@@ -74,8 +84,10 @@ class GymSuite(Suite):
         dtype: npt.DTypeLike = np.uint8 if is_image else np.float32
 
         def copy_of(task: int, pictured: bool = False) -> Callable[[], GymCopy]:
-            spec = gymnasium.registry.get(parse_id(names[task])[1])
-            return partial(_copy, names[task], spec, wrappers, pictured, frame_shape, dtype, layouts[task])
+            spec = spec_of(parse_id(names[task])[1])
+            return partial(
+                _copy, names[task], spec, wrappers, pictured, frame_shape, dtype, layouts[task], outside[task]
+            )
 
         def make(task: int, num_envs: int) -> TaskEnvironment:
             if self.config.subprocesses:
@@ -94,8 +106,8 @@ class GymSuite(Suite):
             references={},
             make=make,
             first_actions=first_actions,
-            thread_safe=is_gymnasiums,
-            versioned=is_gymnasiums,
+            thread_safe=not any(outside),
+            versioned=not any(outside),
             make_pictured=lambda task, num_envs: GymCopies([copy_of(task, True)() for _ in range(num_envs)]),
         )
 
@@ -108,6 +120,7 @@ def _copy(
     frame_shape: tuple[int, ...],
     frame_dtype: npt.DTypeLike,
     layout: FrameLayout,
+    outside: bool,
 ) -> GymCopy:
     """A copy of an environment, also in a process that has not registered its id."""
     module, _ = parse_id(name)
@@ -116,7 +129,17 @@ def _copy(
             if module is not None:  # first: registering an id again is a warning
                 import_plugin_module(module)
         gymnasium.registry.setdefault(spec.id, spec)
-    return GymCopy(name, make_environment(name, wrappers, pictured), frame_shape, frame_dtype, layout.frame)
+    env = make_environment(name, wrappers, pictured)
+    return GymCopy(name, env, frame_shape, frame_dtype, layout.frame, outside=outside)
+
+
+def _require_different(names: tuple[str, ...], probes: list[Env]) -> None:
+    """Refuse two names of one environment."""
+    seen: dict[str, str] = {}
+    for name, env in zip(names, probes, strict=True):
+        env_id = name if env.unwrapped.spec is None else env.unwrapped.spec.id
+        if seen.setdefault(env_id, name) != name:
+            raise TaskError(f"tasks {seen[env_id]} and {name} are both {env_id}, expected every task once")
 
 
 def _require_one_kind(names: tuple[str, ...], layouts: list[FrameLayout]) -> None:

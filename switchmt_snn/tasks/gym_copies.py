@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -38,6 +39,7 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
         frame_dtype: npt.DTypeLike,
         to_frame: Callable[[npt.NDArray[Any]], npt.NDArray[Any]],
         before_reset: Callable[[Env], None] | None = None,
+        outside: bool = False,
     ) -> None:
         """Wrap an environment.
 
@@ -48,12 +50,12 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
             frame_dtype: the suite's frame type.
             to_frame: observation -> channels-first frame.
             before_reset: clears state that the environment's own reset leaves (MinAtar's previous action).
+            outside: it has code from outside this package, Gymnasium and MinAtar (``is_outside``).
         """
         super().__init__(env)
         self._name, self._shape, self._dtype = name, frame_shape, np.dtype(frame_dtype)
         self._to_frame, self._before_reset = to_frame, before_reset
         self._first_action = first_action(env)
-        outside = is_outside(env)
         self._generators = OwnGenerators() if outside else None
         self._drawing = OwnGenerators() if outside else _NOTHING
         self._spaces = _own_spaces(env) if outside else []
@@ -69,19 +71,21 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
                 space.seed(seed)
         if self._before_reset is not None:
             self._before_reset(self.env)
-        with gymnasium_code(self._name, "reset"), self._generators or _NOTHING:
-            answer = self.env.reset(seed=seed)
-        if not (isinstance(answer, tuple) and len(answer) == 2):
-            raise TaskError(f"task {self._name!r} gave {shown(answer)} from reset, expected (observation, info)")
-        return self._frame(answer[0]), {}
+        with gymnasium_code(self._name, "reset"):
+            with self._generators or _NOTHING:
+                answer = self.env.reset(seed=seed)
+            if not (isinstance(answer, tuple) and len(answer) == 2):
+                raise TaskError(f"task {self._name!r} gave {shown(answer)} from reset, expected (observation, info)")
+            return self._frame(answer[0]), {}
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step; the environment's info is left out."""
-        with gymnasium_code(self._name, "step"), self._generators or _NOTHING:
-            observation, reward, ended, cut, _ = self.env.step(int(action) + self._first_action)
-        number = self._one_number(reward)
-        terminated, truncated = self._truth("terminated", ended), self._truth("truncated", cut)
-        return self._frame(observation), number, terminated, truncated, {}
+        with gymnasium_code(self._name, "step"):  # what it returns may hold code of its own, too
+            with self._generators or _NOTHING:
+                observation, reward, ended, cut, _ = self.env.step(int(action) + self._first_action)
+            number = self._one_number(reward)
+            terminated, truncated = self._truth("terminated", ended), self._truth("truncated", cut)
+            return self._frame(observation), number, terminated, truncated, {}
 
     def picture(self) -> Picture | None:
         """What the environment's ``render`` gives, as bytes; None if it was made without pictures.
@@ -100,9 +104,16 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
                     f"pictures of {self._name} need a package that is not installed ({error}); "
                     "run: pip install 'switchmt-snn[video]'"
                 ) from error
-        array = np.asarray(picture)
-        # MinAtar's colours go from 0 to 1.
-        return np.rint(255 * array).astype(np.uint8) if array.dtype.kind == "f" else array
+        array: Picture = np.asarray(picture)
+        if array.dtype.kind != "f":
+            return array
+        low, high = array.min(initial=np.inf), array.max(initial=-np.inf)  # NaN if one value is
+        if not (low >= 0 and high <= 1):  # MinAtar's colours go from 0 to 1
+            raise TaskError(
+                f"task {self._name!r} gave a picture of {array.dtype} from {low:g} to {high:g}, expected uint8, or "
+                "numbers from 0 to 1"
+            )
+        return np.rint(255 * array).astype(np.uint8)
 
     def close(self) -> None:
         """Close the environment."""
@@ -134,7 +145,9 @@ class GymCopy(gymnasium.Wrapper[Any, int, Any, Any]):
                 f"task {self._name!r} gave an observation of shape {array.shape}, expected {space.shape}, the shape of "
                 "its observation_space"
             )
-        if not np.can_cast(array.dtype, space.dtype or np.float32, "same_kind"):
+        # Bytes of a wider type would wrap at 256; numbers of vectors become float32.
+        casting: Any = "safe" if self._dtype == np.uint8 else "same_kind"
+        if not np.can_cast(array.dtype, space.dtype or np.float32, casting):
             raise TaskError(
                 f"task {self._name!r} gave an observation of type {array.dtype}, expected {space.dtype}, the type of "
                 "its observation_space"
@@ -212,10 +225,42 @@ def first_action(env: Env) -> int:
     return int(getattr(env.action_space, "start", 0))
 
 
+_INSIDE = ("gymnasium", "minatar", "switchmt_snn")
+
+
 def is_outside(env: Env) -> bool:
-    """Whether an environment, or one of its wrappers, is neither of this package nor of Gymnasium or MinAtar."""
-    inside = ("gymnasium", "minatar", "switchmt_snn")
-    return any(type(layer).__module__.partition(".")[0] not in inside for layer in _layers(env))
+    """Whether an environment has code that is neither of this package nor of Gymnasium or MinAtar.
+
+    Of a class, of a wrapper, of the function that makes it, or among its arguments: a Gymnasium wrapper around a
+    Gymnasium environment plays by the function that a user gave it.
+    """
+    if any(_of_others(type(layer)) for layer in _layers(env)):
+        return True
+    spec = env.unwrapped.spec
+    if spec is None:
+        return False
+    parts = [(spec.entry_point, spec.kwargs), *((one.entry_point, one.kwargs) for one in spec.additional_wrappers)]
+    return any(_of_others(made) or not _is_plain(arguments) for made, arguments in parts)
+
+
+def is_inside(module: str) -> bool:
+    """Whether a module is of this package, of Gymnasium or of MinAtar."""
+    return module.partition(".")[0] in _INSIDE
+
+
+def _of_others(made: Any) -> bool:
+    """Whether a class, a function or its name, as ``package.module:Name``, is none of theirs."""
+    module = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", "")
+    return made is not None and not is_inside(module)
+
+
+def _is_plain(arguments: Any) -> bool:
+    """Whether arguments are numbers, text, and lists of them, and no code."""
+    try:
+        json.dumps(arguments)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def _layers(env: Env) -> list[Env]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
+from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, load_env_creator, parse_env_id
 
 from switchmt_snn.config.plugins import import_plugin_module, is_plugin, load_plugin, user_code
 from switchmt_snn.config.tasks import BUILT_IN_WRAPPERS
@@ -140,9 +140,19 @@ def _registered(name: str, env_id: str, pictured: bool) -> Env:
     return env
 
 
+def spec_of(env_id: str) -> EnvSpec | None:
+    """What is registered under an id, or without a version its newest, as gymnasium.make takes it; None if nothing."""
+    if env_id in gymnasium.registry:
+        return gymnasium.registry[env_id]
+    namespace, name, version = parse_env_id(env_id)
+    newest = find_highest_version(namespace, name) if version is None else None
+    return None if newest is None else gymnasium.registry.get(get_env_id(namespace, name, newest))
+
+
 def _draws(env_id: str) -> bool:
     """Whether an environment says that it can give pictures; its class is imported for that."""
-    point = gymnasium.spec(env_id).entry_point
+    spec = spec_of(env_id)
+    point = None if spec is None else spec.entry_point
     made = load_env_creator(point) if isinstance(point, str) else point
     metadata = getattr(made, "metadata", None)
     return isinstance(metadata, dict) and PICTURES in metadata.get("render_modes", ())

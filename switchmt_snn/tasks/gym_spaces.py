@@ -173,6 +173,10 @@ def _layout_of(name: str, shape: tuple[int, ...]) -> ImageLayout:
     return signs.pop()
 
 
+MOST_ACTIONS = 100_000
+"""Of a task: a Q-network has an output for each."""
+
+
 def num_actions(name: str, space: gymnasium.Space[Any], wrappers: Sequence[str] = ()) -> int:
     """Actions of a task.
 
@@ -180,6 +184,11 @@ def num_actions(name: str, space: gymnasium.Space[Any], wrappers: Sequence[str] 
         TaskError: they are not ``Discrete``.
     """
     if isinstance(space, gymnasium.spaces.Discrete):
+        if space.n > MOST_ACTIONS:
+            raise TaskError(
+                f"task {name!r} has {space.n:,} actions, expected at most {MOST_ACTIONS:,}: a Q-network has an output "
+                "for each; choose some in a wrapper of your own (gymnasium.ActionWrapper; tasks.wrappers=[module:Name])"
+            )
         return int(space.n)
     remedy = "choose some actions in a wrapper of your own (gymnasium.ActionWrapper; tasks.wrappers=[module:Name])"
     if isinstance(space, (gymnasium.spaces.MultiDiscrete, gymnasium.spaces.MultiBinary)):

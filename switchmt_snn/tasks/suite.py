@@ -272,6 +272,11 @@ class Suite:
         return ()
 
     @property
+    def registered(self) -> dict[str, str]:
+        """What decides how tasks are made and stands in no file, config or package's version, by name. Here nothing."""
+        return {}
+
+    @property
     def files(self) -> dict[str, Path]:
         """Files that decide what is learned, by a short name: a run stores their SHA-256. Here the suite's module."""
         suite = type(self)

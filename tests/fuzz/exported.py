@@ -190,7 +190,8 @@ def _change_item(file: h5py.File, name: str, rng: random.Random) -> None:
         del file[name]
         file[name] = rng.choice((h5py.SoftLink("/"), h5py.ExternalLink("/etc/passwd", "/"), h5py.SoftLink("/node")))
     elif change == 3:
-        file[f"{name}-{rng.randrange(10**9)}"] = file.get("node", file)
+        target = file.get("node", file)  # an earlier change may have made it a link to another file
+        file[f"{name}-{rng.randrange(10**9)}"] = target if target.file == file else h5py.SoftLink("/node")
     else:
         stored = item[()] if isinstance(item, h5py.Dataset) else 0
         value = rng.choice(

@@ -188,6 +188,37 @@ class WideByte(Plain):
         return later(np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 300), self)
 
 
+class WideUnsignedByte(WideByte):
+    """uint16 for a uint8 space, whose 300 would be 44."""
+
+    def observe(self) -> Any:
+        return later(np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 300, np.uint16), self)
+
+
+class GradientReward(Plain):
+    def reward(self, action: Any) -> Any:
+        return later(0.0, torch.ones((), requires_grad=True), self)
+
+
+class WholeReward(Plain):
+    """Of more digits than a float has room for."""
+
+    def reward(self, action: Any) -> Any:
+        return later(0.0, 10**400, self)
+
+
+class FloatPicture(Plain):
+    """Colours from 0 to 255 as floating-point numbers."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        return np.full((8, 8, 3), 200.0)
+
+
 class Offset(Plain):
     """Actions -1, 0 and 1."""
 
@@ -491,11 +522,24 @@ class Halves(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
         return observation / 2
 
 
+def noisy(env: gymnasium.Env) -> gymnasium.Env:  # type: ignore[type-arg]
+    """Gymnasium's wrapper, and a function of one's own."""
+    return gymnasium.wrappers.TransformReward(env, lambda reward: reward + np.random.normal())
+
+
+def noisy_cartpole(**arguments: Any) -> gymnasium.Env:  # type: ignore[type-arg]
+    """Gymnasium's environment and wrapper, made by a function of one's own."""
+    return noisy(gymnasium.make("CartPole-v1", **arguments))
+
+
 def register() -> None:
     """Make every class known to Gymnasium as ``Name-v0``."""
     for value in list(globals().values()):
         if isinstance(value, type) and issubclass(value, Plain):
             gymnasium.register(f"{value.__name__}-v0", value, max_episode_steps=None)
+    gymnasium.register("NoisyCartPole-v0", noisy_cartpole)
+    gymnasium.register("OwnCartPole-v0", "gymnasium.envs.classic_control:CartPoleEnv", kwargs={"own": print})
+    gymnasium.register("ShortCartPole-v0", "gymnasium.envs.classic_control:CartPoleEnv", max_episode_steps=7)
 
 
 register()

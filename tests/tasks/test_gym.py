@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 import sys
 from pathlib import Path
@@ -14,9 +15,12 @@ import pytest
 import torch
 
 from switchmt_snn.config import TasksConfig
+from switchmt_snn.config.plugins import import_plugin_module
 from switchmt_snn.errors import ConfigError, TaskError
+from switchmt_snn.tasks.gym import GymSuite
+from switchmt_snn.tasks.gym_copies import is_outside
 from switchmt_snn.tasks.gym_make import make_environment
-from switchmt_snn.tasks.gym_spaces import RoundedObservation, frame_layout, rounding
+from switchmt_snn.tasks.gym_spaces import RoundedObservation, frame_layout, num_actions, rounding
 from switchmt_snn.tasks.play import Play
 from switchmt_snn.tasks.registry import make_suite
 from switchmt_snn.tasks.suite import TaskSuite
@@ -69,6 +73,9 @@ def rewards(suite: TaskSuite, steps: int = 20, num_envs: int = 1) -> list[list[f
         ("ListReward", r"gave reward = \[1\.0\], expected one number"),
         ("TwoRewards", r"gave reward = array\(\[ 0., -1.\]\), expected one number; make it one in a wrapper"),
         ("WideByte", "gave an observation of type int64, expected uint8"),
+        ("WideUnsignedByte", "gave an observation of type uint16, expected uint8"),
+        ("GradientReward", r"fails in step \(RuntimeError: .*\), expected step\(action\) -> \(observation, reward, "),
+        ("WholeReward", r"fails in step \(OverflowError: .*\), expected step\(action\) -> \(observation, reward, "),
         ("Raises", r"fails in step \(ZeroDivisionError: division by zero at odd_envs.py, line \d+\)"),
     ],
 )
@@ -342,6 +349,87 @@ def test_only_environments_of_gymnasium_itself_are_played_in_several_threads_and
     assert (suite_of("Plain").thread_safe, suite_of("Plain").versioned) == (False, False)
     wrapped = TasksConfig(suite="gym", names=("CartPole-v1",), wrappers=(f"{MODULE}:Halves",))
     assert (make_suite(wrapped).thread_safe, make_suite(wrapped).versioned) == (False, False)
+    assert (suite_of("ShortCartPole").thread_safe, suite_of("ShortCartPole").versioned) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrappers"),
+    [("NoisyCartPole-v0", ()), ("CartPole-v1", (f"{MODULE}:noisy",)), (f"{MODULE}:NoisyCartPole-v0", ())],
+)
+def test_a_function_of_ones_own_in_a_class_of_gymnasium_is_code_of_ones_own(
+    name: str, wrappers: tuple[str, ...]
+) -> None:
+    """Its episodes are a function of their seed, are played in one thread, and random play is not kept."""
+    import_plugin_module(MODULE)
+    suite = make_suite(TasksConfig(suite="gym", names=(name,), wrappers=wrappers))
+    assert (suite.thread_safe, suite.versioned) == (False, False)
+    played = rewards(suite, 5)
+    assert played == rewards(suite, 5)
+    assert {reward for row in played for reward in row}.isdisjoint({0.0, 1.0})
+
+
+def test_arguments_that_hold_code_are_code_of_ones_own() -> None:
+    import_plugin_module(MODULE)
+    env = gymnasium.make("CartPole-v1")
+    assert not is_outside(env)
+    for spec in (gymnasium.spec("OwnCartPole-v0"), gymnasium.spec("NoisyCartPole-v0")):
+        env.unwrapped.spec = spec
+        assert is_outside(env)
+
+
+def test_how_an_id_is_registered_decides_random_play(monkeypatch: pytest.MonkeyPatch) -> None:
+    suite = GymSuite(TasksConfig(suite="gym", names=("CartPole-v1",)))
+    before = suite.registered
+    spec = copy.deepcopy(gymnasium.registry["CartPole-v1"])
+    spec.max_episode_steps = 7
+    monkeypatch.setitem(gymnasium.registry, "CartPole-v1", spec)
+    assert suite.registered != before
+    assert GymSuite(TasksConfig(suite="gym", names=("CartPole",))).registered["CartPole"] == repr(spec)
+
+
+@pytest.mark.parametrize("names", [("CartPole-v1", "gymnasium:CartPole-v1"), ("CartPole", "CartPole-v1")])
+@pytest.mark.filterwarnings("ignore:.*latest versioned")
+def test_two_names_of_one_environment_are_refused(names: tuple[str, str]) -> None:
+    with pytest.raises(
+        TaskError, match=f"tasks {names[0]} and {names[1]} are both CartPole-v1, expected every task once"
+    ):
+        make_suite(TasksConfig(suite="gym", names=names))
+
+
+@pytest.mark.filterwarnings("ignore:.*latest versioned")
+def test_an_id_without_its_version_is_drawn() -> None:
+    pytest.importorskip("pygame")
+    play = Play(make_suite(TasksConfig(suite="gym", names=("CartPole",))).pictured(), 0, 1)
+    play.begin(np.arange(1), np.arange(1))
+    assert play.picture(0) is not None
+
+
+@pytest.mark.filterwarnings("ignore")  # Gymnasium's own checker asks for bytes
+def test_a_picture_of_numbers_above_1_is_refused() -> None:
+    play = Play(suite_of("FloatPicture").pictured(), 0, 1)
+    play.begin(np.arange(1), np.arange(1))
+    with pytest.raises(
+        TaskError, match="gave a picture of float64 from 200 to 200, expected uint8, or numbers from 0 to"
+    ):
+        play.picture(0)
+
+
+def test_more_actions_than_a_network_has_outputs_for_are_refused() -> None:
+    for count in (10**5 + 1, 2**40):
+        with pytest.raises(TaskError, match=rf"has {count:,} actions, expected at most 100,000: a Q-network"):
+            num_actions("a", gymnasium.spaces.Discrete(count))
+    assert num_actions("a", gymnasium.spaces.Discrete(10**5)) == 10**5
+
+
+@pytest.mark.parametrize("raised", ["ImportError", "RuntimeError", "KeyError"])
+def test_a_name_that_is_looked_up_when_asked_for_may_fail(
+    raised: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f"lazy_{raised}.py").write_text(f"def __getattr__(name):\n    raise {raised}('no')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    wrapped = TasksConfig(suite="gym", names=("CartPole-v1",), wrappers=(f"lazy_{raised}:A",))
+    with pytest.raises(ConfigError, match=rf"looking it up fails \({raised}: .* at lazy_{raised}.py, line 2\)"):
+        make_suite(wrapped)
 
 
 def test_the_wrapper_of_the_examples_sets_one_number_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
