@@ -24,6 +24,14 @@ paper) and gives the next visit to the game that is furthest from its own. The f
 told; but the scores of three-held-s3 are those of one seed, and a seed can be slower.
 `checkpoints/` holds the last weights.
 """,
+    "held-enduro-s1": """\
+`strong` with seed 1 and random actions that last in Enduro only (`learning.longest_random_action_steps_by_task: [1, 1,
+100]`), stopped after 200,000 of 1,000,000 steps. The question was whether random actions that last delay Pong.
+**They do not explain it: without them Pong is not learned at all in 83,480 steps of its own**, later than in any run
+with them. The preset stays as it is. Alone, the same network with the same seed begins to learn Pong in half of these
+steps (pong-float32-s1, pong-bfloat16-s1). Of the runs with three games, three-half-s1, three-held-s1 and three-held-s3
+began before 65,000 steps of Pong, three-held-s2, deficit-s1 and this one did not: what decides that is not known.
+""",
     "lagging-s1": """\
 Stopped: **Pong diverged.** Its mean Q rises to 8 while it loses every game, because the network that acts and gives
 targets is another one than the network that learns. The background of Pong is a bright constant, 0.42 of the range, so
@@ -32,6 +40,15 @@ BatchNorm's running mean stays behind (`off_conv1` below: 0.21 standard deviatio
 target then chooses and values actions by chance, and the largest of some random values is too large. The preset
 `strong` has four settings against it: `double_q`, `reestimate_statistics_batches`, `next_statistics` and
 `acting_network`.
+""",
+    "pong-bfloat16-s1": """\
+pong-float32-s1 with updates and training's actions in bfloat16, stopped when the comparison was made. **Pong alone is
+learned in bfloat16, too**, as in pong-s1 (float32) and some 10,000 steps later than in pong-float32-s1; one seed each
+cannot tell whether that is the precision.
+""",
+    "pong-float32-s1": """\
+The preset `pong` with seed 1, and native updates and actions in float32; those of pong-s1 were compiled and eager,
+which rounds otherwise. Stopped when the comparison with pong-bfloat16-s1 was made.
 """,
     "pong-s1": """\
 Pong alone, the preset `pong`: half the paper's channels (981,334 parameters as deployed), two simulation steps.

@@ -105,7 +105,7 @@ def test_a_pretrained_run_is_read_where_it_is_and_copied_to_be_written(own: Path
     assert bytes_of(own) == before
     written = {name for name in bytes_of(copied) if not name.startswith("random_play/")} - set(before)
     assert written == {
-        f"evaluations/step-000000000400_Acrobot-v1+CartPole-v1_n2_seed5_epsilon0.05_envs2.{kind}"
+        f"evaluations/step-000000000400_Acrobot-v1+CartPole-v1_n2_seed5_epsilon0.05_envs2_longest60.{kind}"
         for kind in ("csv", "json")
     }
     assert open_run("pretrained/small", to_write=True).path == copied  # the copy with its results, not a fresh one
