@@ -176,7 +176,7 @@ def nir_mutant(good: bytes, seed: int) -> bytes:
             names: list[str] = []
             file.visit(names.append)
             name = rng.choice(names)
-            with contextlib.suppress(OSError, RuntimeError):  # HDF5 refuses it after an earlier change (links in a ring)
+            with contextlib.suppress(OSError, RuntimeError):  # HDF5 refuses it after an earlier change
                 _change_item(file, name, rng)
     return content.getvalue()
 
