@@ -243,8 +243,8 @@ class _Driver:
             self._note(text)
         try:
             with stop_requests() as requested:
-                if resumed_at is not None and self._owes_evaluation(resumed_at):
-                    self._evaluate_in_training(requested)
+                if resumed_at is not None:
+                    self._make_up_for(resumed_at, requested)
                 stopped = requested() and training.steps < self.config.total_steps
                 for event in () if self.solved or stopped else training.events():
                     logs(event)
@@ -268,6 +268,12 @@ class _Driver:
         if stopped:
             return RunResult(path, "stopped", training.steps, None)
         return RunResult(path, "finished", training.steps, self._evaluate(self._final_evaluation()), self.solved)
+
+    def _make_up_for(self, step: int, requested: Callable[[], bool]) -> None:
+        """What a process that was killed after a checkpoint may not have done: judge it, and evaluate."""
+        self.best.at_checkpoint(step, self.training.settled_acting_network)
+        if self._owes_evaluation(step):
+            self._evaluate_in_training(requested)
 
     def _restore(self) -> tuple[dict[str, int] | None, int | None, list[str]]:
         """Load the newest whole checkpoint, if there is any: log sizes, its step, and what the user should know."""

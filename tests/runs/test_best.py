@@ -17,6 +17,7 @@ from switchmt_snn.cli import main
 from switchmt_snn.config import EvaluationConfig
 from switchmt_snn.config.yaml_io import from_dict, to_yaml
 from switchmt_snn.errors import CheckpointError
+from switchmt_snn.runs import best as best_module
 from switchmt_snn.runs.best import rise_above_random
 from switchmt_snn.runs.checkpoint import Best, CheckpointStore
 from switchmt_snn.runs.evaluations import Evaluations
@@ -54,6 +55,44 @@ def test_without_evaluations_they_are_chosen_by_training_returns(tmp_path: Path)
     best = CheckpointStore(tmp_path / "run" / "checkpoints").best()
     assert best is not None
     assert (best.judged_by, best.step % 200) == ("returns", 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["not judged", "half replaced"])
+def test_weights_that_a_killed_run_has_not_judged_are_judged_when_it_goes_on(
+    lost: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best of an uninterrupted run is of its second checkpoint; killed there, it is found again."""
+    config = from_dict({**CARTPOLE, "total_steps": 800, "evaluation": {"episodes": 1}})
+    scores = {200: 0.1, 400: 0.9, 600: 0.5, 800: 0.2}
+    monkeypatch.setattr(best_module, "rise_of_returns", lambda *_: scores[stores[-1]])
+    stores: list[int] = []
+    save, save_best = CheckpointStore.save, CheckpointStore.save_best
+
+    def saved(self: CheckpointStore, step: int, *rest: Any) -> Path:
+        stores.append(step)
+        return save(self, step, *rest)
+
+    def killed(self: CheckpointStore, step: int, *rest: Any) -> None:
+        if step != 400:
+            return save_best(self, step, *rest)
+        if lost == "half replaced":
+            shutil.rmtree(self.folder / "best")
+            (self.folder / ".best.tmp").mkdir()
+        raise MemoryError("killed")
+
+    monkeypatch.setattr(CheckpointStore, "save", saved)
+    train(config, tmp_path / "whole")
+    monkeypatch.setattr(CheckpointStore, "save_best", killed)
+    with pytest.raises(MemoryError):
+        train(config, tmp_path / "run")
+    monkeypatch.setattr(CheckpointStore, "save_best", save_best)
+    train(run=tmp_path / "run")
+    for name in ("manifest.json", "model.safetensors"):
+        whole, again = (tmp_path / run / "checkpoints" / "best" / name for run in ("whole", "run"))
+        assert whole.read_bytes() == again.read_bytes()
+    assert CheckpointStore(tmp_path / "run" / "checkpoints").best() == Best(400, 0.9, "returns")
+    assert not (tmp_path / "run" / "checkpoints" / ".best.tmp").exists()
 
 
 def test_a_run_whose_checkpoints_are_gone_does_not_begin_anew(tmp_path: Path) -> None:
