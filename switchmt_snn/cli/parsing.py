@@ -164,9 +164,9 @@ def split_one(kind: Any, argv: list[str], command: str, default: Any) -> tuple[s
 
 
 def _shown(command: str) -> str:
-    """The argument in the line of usage."""
-    name = ARGUMENTS[command][0]
-    return f" [{name}]" if name else ""
+    """The argument in the line of usage, in brackets if it has a default."""
+    name, meaning = ARGUMENTS[command]
+    return "" if not name else f" [{name}]" if "(default: " in meaning else f" {name}"
 
 
 def _description(kind: Any, command: str) -> str:
