@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import time
@@ -32,7 +31,7 @@ from switchmt_snn.export.runtimes.agents import ComparedAgent, NirAgent, OnnxAge
 from switchmt_snn.export.runtimes.guarded import read_file
 from switchmt_snn.machine.torch_settings import as_when_started
 from switchmt_snn.runs.evaluations import evaluation_name
-from switchmt_snn.runs.files import file_name, json_text, made, sha256, write_atomically
+from switchmt_snn.runs.files import file_name, json_text, made, parsed_json, sha256, write_atomically
 from switchmt_snn.runs.folder import RunFolder
 from switchmt_snn.runs.model_card import CARD, model_card
 from switchmt_snn.runs.packing import open_run
@@ -374,11 +373,11 @@ def _exported(folder: RunFolder, name: str, flag: str, checkpoint: str) -> Path:
         raise ExportError(f"no {path}, expected an exported run; {again}")
     beside = path.with_name("parity.json")
     try:
-        parity = json.loads(read_file(beside, "what export compared"))
+        parity = parsed_json(read_file(beside, "what export compared"))
         files = parity.get("files", {})
         # Exports from before the sums were kept have none.
         unchanged = "files" not in parity or files.get(name) == sha256(read_file(path, "an exported file"))
-    except (ExportError, ValueError, RecursionError, AttributeError) as error:
+    except (ExportError, ValueError, AttributeError) as error:
         raise ExportError(f"{beside} cannot be read, expected what export compared; {again}") from error
     if not unchanged:
         raise ExportError(f"{path} is not the file that export compared (another checksum), expected that one; {again}")

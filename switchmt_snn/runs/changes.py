@@ -45,7 +45,7 @@ def note_changes(folder: Path, environment: dict[str, Any], step: int) -> list[s
         for row in rows:
             for kind, values in known.items():
                 values |= row.get(kind, {})
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise RunFolderError(
             f"{path} cannot be read ({reason_of(error):.80}), expected JSON lines; delete it"
         ) from error

@@ -165,9 +165,7 @@ def _read(path: Path) -> dict[str, Any]:
                 row[key] = None if row.get(key) is None else _number(row[key])
             if not all(isinstance(row[key], str) and row[key].isprintable() for key in ("policy", "task")):
                 raise ValueError("a policy or a task is no printable text")
-    except (
-        ArithmeticError, AttributeError, ConfigError, KeyError, OSError, RecursionError, TypeError, ValueError
-    ) as error:  # fmt: skip
+    except (ArithmeticError, AttributeError, ConfigError, KeyError, OSError, TypeError, ValueError) as error:
         raise RunFolderError(
             f"{path} cannot be read ({reason_of(error):.80}), expected an evaluation; delete it, or evaluate again"
         ) from error

@@ -17,6 +17,9 @@ from switchmt_snn.machine.temporary import temporary_beside
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _LONGEST_LIST = 120
+MOST_LEVELS = 100
+"""Lists and objects in each other that a JSON file may have; the deepest that we write has some twelve."""
+_TOO_DEEP = f"more than {MOST_LEVELS} levels"
 _NOT_TASKS = frozenset({"parity", "evaluation_onnx", "evaluation_nir"})
 """Names of our own JSON files in a run's ``export`` folder, where each task has a JSON file, too."""
 
@@ -55,15 +58,35 @@ def json_text(value: Any, indent: int | None = None) -> str:
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
+def _require_shallow(value: Any) -> None:
+    level, levels = [value], 0
+    while level := [one for one in level if isinstance(one, (dict, list))]:
+        levels += 1
+        if levels > MOST_LEVELS:
+            raise ValueError(_TOO_DEEP)
+        level = [inner for one in level for inner in (one.values() if isinstance(one, dict) else one)]
+
+
 def parsed_json(content: bytes | str) -> Any:
     """The value of JSON in UTF-8. ``json.loads`` also takes halves of characters, which no page can hold.
 
     Raises:
-        ValueError: it is no JSON, no UTF-8, or has a text with half of a character.
-        RecursionError: it is too deep.
+        ValueError: it is no JSON, no UTF-8, has a text with half of a character, or more than ``MOST_LEVELS`` levels
+            (where Python itself gives up depends on how deep its caller is).
+
+    Examples:
+        >>> parsed_json("[" * 101 + "]" * 101)
+        Traceback (most recent call last):
+        ...
+        ValueError: more than 100 levels
     """
     text = content if isinstance(content, str) else content.decode()
-    value = json.loads(text)
+    try:
+        value = json.loads(text)
+    except RecursionError as error:
+        raise ValueError(_TOO_DEEP) from error
+    if text.count("[") + text.count("{") > MOST_LEVELS:
+        _require_shallow(value)
     if "\\u" in text:
         json.dumps(value, ensure_ascii=False).encode()
     return value

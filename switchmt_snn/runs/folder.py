@@ -91,7 +91,7 @@ def read_environment(run: Path) -> dict[str, Any]:
     path = run / "environment.json"
     try:
         facts = parsed_json(path.read_bytes()) if path.is_file() else None
-    except (OSError, ValueError, RecursionError):
+    except (OSError, ValueError):
         facts = None
     if not isinstance(facts, dict):
         raise RunFolderError(f"{path} cannot be read, expected the JSON that training wrote; restore the file")

@@ -223,7 +223,7 @@ def _parsed(path: Path, rows: Iterator[tuple[int, Any]], parse: Callable[[Any], 
     for number, row in rows:
         try:
             yield parse(row)
-        except (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunFolderError(
                 f"{path} line {number} cannot be read ({reason_of(error):.80}), expected a line as training "
                 "writes it; restore the file from a copy, or delete the line"

@@ -64,8 +64,8 @@ def read_json(content: bytes, name: str) -> Any:
         raise CheckpointError(f"{name} has {len(content):,} bytes, expected at most {MOST_BYTES:,}")
     try:
         return parsed_json(content)
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{name} is not JSON") from error
+    except ValueError as error:
+        raise CheckpointError(f"{name} is not JSON ({error!s:.60})") from error
 
 
 def _whole(value: Any) -> bool:

@@ -20,6 +20,7 @@ from typing import Any
 
 from switchmt_snn.config import ExperimentConfig, SwitchingConfig, to_dict, to_yaml
 from switchmt_snn.errors import TrainingFailed
+from switchmt_snn.runs.files import parsed_json
 from switchmt_snn.runs.listing import folder_bytes
 from switchmt_snn.runs.plan import plan
 from switchmt_snn.study.engine import last_words
@@ -238,7 +239,7 @@ def _rows(run: Path) -> list[dict[str, Any]]:
         text = (run / "metrics.jsonl").read_text("utf-8")
     except OSError:
         return []
-    return [dict(json.loads(line)) for line in text[: text.rfind("\n") + 1].splitlines()]
+    return [dict(parsed_json(line)) for line in text[: text.rfind("\n") + 1].splitlines()]
 
 
 def _slope(rows: Sequence[dict[str, Any]]) -> float:

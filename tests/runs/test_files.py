@@ -8,13 +8,14 @@ import math
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from switchmt_snn.errors import WriteError
-from switchmt_snn.runs.files import file_name, json_text, write_atomically, writing, written_whole
+from switchmt_snn.runs.files import file_name, json_text, parsed_json, write_atomically, writing, written_whole
 from switchmt_snn.tasks.registry import SUITES
 
 TASKS = st.one_of(
@@ -98,3 +99,20 @@ def test_json_holds_no_number_that_json_does_not_know() -> None:
         "a": [1.5, None, [None, None]],
         "b": {"c": None, "d": "NaN"},
     }
+
+
+@pytest.mark.parametrize("frames", [0, 700])
+@pytest.mark.parametrize("levels", [101, 400, 100_000])
+def test_json_that_is_too_deep_is_refused_wherever_it_is_read(levels: int, frames: int) -> None:
+    def read(frames: int) -> Any:
+        return read(frames - 1) if frames else parsed_json("[" * levels + "]" * levels)
+
+    with pytest.raises(ValueError, match="more than 100 levels"):
+        read(frames)
+
+
+def test_json_of_a_hundred_levels_is_read() -> None:
+    value = parsed_json('{"a": [' * 50 + "]}" * 50)
+    for _ in range(49):
+        value = value["a"][0]
+    assert value == {"a": []}
