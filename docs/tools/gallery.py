@@ -133,7 +133,7 @@ and the number that decided.
 
 ## Several runs side by side
 
-`switchmt-snn report` with three runs that differ in their seed; bands are over seeds.
+`switchmt-snn compare` with three runs that differ in their seed; bands are over seeds.
 
 ![Comparison of runs](pictures/comparison.png)
 

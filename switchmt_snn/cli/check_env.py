@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from switchmt_snn.cli.parsing import parse, split
@@ -56,19 +56,39 @@ def command(argv: list[str]) -> int:
         wrappers=options.wrappers,
         image_layout=options.image_layout,
     )
+    refused = _refused_network(options, tuple(names))
     if options.json:
-        output.print_json([report.to_dict() for report in reports])
+        output.print_json([{**report.to_dict(), "refused_network": refused} for report in reports])
         return 0
     for report in reports:
-        print("\n".join(_lines(report)))
+        print("\n".join(_lines(report, refused)))
     return 0
+
+
+def _refused_network(options: CheckEnvOptions, names: tuple[str, ...]) -> str | None:
+    """Why ``train`` without CONFIG refuses to build a network for these tasks; None if it builds one."""
+    from switchmt_snn.config import load_config, resolve
+    from switchmt_snn.learning.parts import observation_spec
+    from switchmt_snn.spiking.network import build_network
+    from switchmt_snn.tasks.registry import make_suite
+
+    asked = load_config("quickstart")
+    tasks = replace(
+        asked.tasks, suite=options.suite, names=names, wrappers=options.wrappers, image_layout=options.image_layout
+    )
+    try:
+        config = resolve(replace(asked, tasks=tasks))
+        build_network(config.network, observation_spec(make_suite(config.tasks)), seed=0)
+    except ConfigError as error:
+        return str(error)
+    return None
 
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _lines(report: EnvironmentReport) -> list[str]:
+def _lines(report: EnvironmentReport, refused_network: str | None) -> list[str]:
     kinds = {
         "vector": "a vector of {0} numbers",
         "channels_last": "images, channels last: frames of {0} channels, {1} x {2}",
@@ -106,9 +126,11 @@ def _lines(report: EnvironmentReport) -> list[str]:
         "threads": f"evaluations use {threads}; the same in several: {yes[report.same_in_threads]}",
         "speed": f"{report.steps_per_s:,.0f} steps/s, one copy",
     }
-    lines = [f"{report.task} ({report.suite}): can be trained"]
+    trained = "can be trained" if refused_network is None else "can be played, but train's own network does not fit"
+    lines = [f"{report.task} ({report.suite}): {trained}"]
     lines += [f"  {key:<10} {value}" for key, value in rows.items() if value is not None]
-    return [*lines, *(f"  note: {note}" for note in report.notes)]
+    notes = report.notes if refused_network is None else (refused_network, *report.notes)
+    return [*lines, *(f"  note: {note}" for note in notes)]
 
 
 def _numbers(actions: tuple[int, ...]) -> str:

@@ -17,7 +17,7 @@ usage: switchmt-snn COMMAND [options]
   play [RUN]          record a video of a run's agent beside its spikes, Q-values and gains (default: newest run)
   export [RUN]        write ONNX and NIR files with a model card, and prove that they decide alike (default: newest run)
   profile [RUN ...]   spikes, operations, energy and chips on recorded play, with a report (default: newest run)
-  report [RUN ...]    plot curves, switches, layers and scores on one HTML page (default: newest run)
+  report [RUN]        plot curves, switches, layers and scores on one HTML page (default: newest run)
   compare RUN RUN ... the same of several runs side by side, seeds as bands
   study CONFIG        many runs: variants, grids and seeds from one YAML file, each a plain run; resumable
   replay-policies [RUN]  at which episode end each policy would have left the visits of a run (default: newest run)

@@ -28,10 +28,7 @@ ARGUMENTS = {
     "play": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "export": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "profile": ("RUN", "run folders, pretrained/NAME, or NIR files (default: the run under runs/ that was begun last)"),
-    "report": (
-        "RUN",
-        "run folders or pretrained/NAME; several are compared (default: the run that was begun last)",
-    ),
+    "report": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),
     "compare": ("RUN", "two or more run folders or pretrained/NAME"),
     "study": ("CONFIG", "a YAML file (docs/studies.md), a study that comes with the package, or a study's folder"),
     "replay-policies": ("RUN", "a run folder or pretrained/NAME (default: the run under runs/ that was begun last)"),

@@ -203,16 +203,17 @@ class QNetwork(nn.Module):
         config, tasks = self.config, self.observation.num_tasks
         hidden = cast(int, config.hidden_units)
         per_neuron = hidden if config.dendrites == "per_neuron" else 1
+        heads = tasks if config.heads == "per_task" else 1
         sizes = {
-            "hidden_units": hidden * inputs,
-            "quantiles": hidden * outputs * (tasks if config.heads == "per_task" else 1),
-            "dendritic_segments": config.dendritic_segments * tasks * per_neuron,
+            "hidden_units": (hidden * inputs, f"for {inputs:,} inputs", ", or make the observations smaller"),
+            "quantiles": (hidden * outputs * heads, f"for {outputs * heads:,} outputs", ", or take fewer actions"),
+            "dendritic_segments": (config.dendritic_segments * tasks * per_neuron, f"for {tasks} tasks", ""),
         }
-        for name, weights in sizes.items():
+        for name, (weights, where, other) in sizes.items():
             if weights > MOST_WEIGHTS:
                 raise ConfigError(
-                    f"network.{name} is {getattr(config, name)}, which makes a layer of {weights:,} weights, expected "
-                    f"at most {MOST_WEIGHTS:,}; lower it"
+                    f"network.{name} is {getattr(config, name)}, which makes a layer of {weights:,} weights {where}, "
+                    f"expected at most {MOST_WEIGHTS:,}; lower it{other}"
                 )
 
     def _build_trunk(self) -> tuple[int, ...]:

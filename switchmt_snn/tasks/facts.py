@@ -147,6 +147,10 @@ def _are_published(published: Any) -> bool:
     )
 
 
+def _are_words(words: Any) -> bool:
+    return isinstance(words, dict) and all(isinstance(text, str) for pair in words.items() for text in pair)
+
+
 def _are_files(files: Any) -> bool:
     return isinstance(files, dict) and all(isinstance(path, Path) and path.is_file() for path in files.values())
 
@@ -164,6 +168,7 @@ _FACTS: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("frames_per_s", lambda rate: rate is None or (_number(rate) and rate > 0), "a number above 0, or None"),
     ("steps_to_learn", lambda steps: steps is None or (_whole(steps) and steps > 0), "a whole number above 0, or None"),
     ("process_bytes", lambda count: _whole(count) and count >= 0, "a whole number of at least 0"),
+    ("registered", _are_words, "a text for each name, as {'levels.txt': its checksum}"),
     ("files", _are_files, "a pathlib.Path of a file that exists, by its name"),
 )
 """What a suite states: the attribute, whether a value will do, and what will."""

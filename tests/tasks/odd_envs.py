@@ -40,6 +40,15 @@ def later(right: Any, wrong: Any, env: Plain) -> Any:
     return wrong if env.steps > 25 else right
 
 
+class TooWide(Plain):
+    """More numbers than the network of the quickstart has weights for."""
+
+    observation_space = Box(0.0, 10.0, (300_000,), np.float32)
+
+    def observe(self) -> Any:
+        return np.full(300_000, self.steps / 10, np.float32)
+
+
 class ShortObservation(Plain):
     def observe(self) -> Any:
         return later(super().observe(), np.zeros(2, np.float32), self)

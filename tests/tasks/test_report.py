@@ -181,6 +181,22 @@ def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> Non
         main([*words, "--json"])
     (facts,) = json.loads(capsys.readouterr().out)
     assert facts["layout"] == "channels_first"
+    assert facts["refused_network"] is None
+
+
+def test_the_command_says_that_no_network_fits(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["check-env", f"{MODULE}:TooWide-v0", "--steps", "2"]
+    with pytest.raises(SystemExit) as done:
+        main(words)
+    assert done.value.code == 0
+    text = capsys.readouterr().out
+    assert "TooWide-v0 (gym): can be played, but train's own network does not fit" in text
+    assert "note: network.hidden_units is 128, which makes a layer of 38,400,000 weights for 300,000 inputs" in text
+    assert "lower it, or make the observations smaller" in text
+    with pytest.raises(SystemExit):
+        main([*words, "--json"])
+    (facts,) = json.loads(capsys.readouterr().out)
+    assert facts["refused_network"].startswith("network.hidden_units is 128")
 
 
 @pytest.mark.parametrize(

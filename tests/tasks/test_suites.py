@@ -240,6 +240,7 @@ def test_what_a_suite_raises_is_one_line(
         ("tasks_with_lives", ("c",), "a tuple of names in"),
         ("packages", "numpy", "a tuple of names"),
         ("masks_actions", "no", "True or False"),
+        ("registered", {"levels": 3}, "a text for each name"),
         ("files", {"weights": "weights.bin"}, "a pathlib.Path of a file that exists"),
     ],
 )
