@@ -31,6 +31,7 @@ from switchmt_snn.spiking.encoding_check import try_encoding
 from switchmt_snn.tasks.check import check_before_training, warnings_unless_refused
 from switchmt_snn.tasks.registry import make_suite, register_suite, suite_of
 from switchmt_snn.tasks.suite import Suite, TaskSuite
+from switchmt_snn.updates.compiled import planned_updates
 from switchmt_snn.updates.engine import ENGINES
 
 
@@ -105,7 +106,18 @@ def plan(
     memory = describe_method(config, suite).memory
     require_memory(memory, config, suite)
     require_gpu_memory(config, suite)
-    return Plan(config, suite, device, memory, (*warnings, *notes))
+    return Plan(config, suite, device, memory, (*warnings, *notes, *_learning_rate_notes(config)))
+
+
+def _learning_rate_notes(config: ExperimentConfig) -> tuple[str, ...]:
+    """What to say of a learning rate that is 0 before the run's last updates, as in a preset that is trained longer."""
+    decay, planned = config.learning.learning_rate_decay_updates, planned_updates(config)
+    if decay is None or planned <= decay:
+        return ()
+    return (
+        f"the learning rate is 0 after {decay:,} of up to {planned:,} updates, and later ones change nothing "
+        f"(learning.learning_rate_decay_updates {planned} lets it fall to the end)",
+    )
 
 
 def decide(

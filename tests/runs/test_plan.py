@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,14 @@ def test_a_planned_config_holds_no_auto_but_the_device() -> None:
     assert made.memory.total_bytes > made.memory.replay_bytes > 0
     again = plan(made.config, made.config)
     assert (again.config, again.notes) == (made.config, ())
+
+
+def test_a_learning_rate_that_ends_before_the_run_is_named() -> None:
+    preset = replace(load_config("cartpole"), device="cpu")
+    assert not any("learning rate" in note for note in plan(preset).notes)
+    (note,) = [note for note in plan(replace(preset, total_steps=120_000)).notes if "learning rate" in note]
+    assert "is 0 after 30,000 of up to 59,904 updates" in note
+    assert "learning.learning_rate_decay_updates 59904" in note
 
 
 def test_a_run_that_cannot_fit_is_refused_by_its_plan(monkeypatch: pytest.MonkeyPatch) -> None:
