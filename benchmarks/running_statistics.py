@@ -17,15 +17,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
+from benchmarks.restored import drawn, q_values, restored, tasks_learned
 from switchmt_snn.learning.statistics import reestimate_statistics
 from switchmt_snn.learning.training import Training
-from switchmt_snn.replay.ring import Returns
-from switchmt_snn.runs.folder import RunFolder
-from switchmt_snn.runs.plan import plan
 from switchmt_snn.spiking.network import QNetwork
 from switchmt_snn.spiking.normalization import TaskBatchNorm
 
@@ -34,30 +30,21 @@ BATCHES, BATCH_SIZE, SEED = 16, 64, 0
 
 def rows(run: Path) -> Iterator[dict[str, Any]]:
     """One row for each task of a run's newest checkpoint."""
-    folder = RunFolder(run)
-    config = folder.config()
-    planned = plan(config, config)
-    training = Training(planned.config, planned.suite, planned.device)
-    loaded = folder.checkpoints().load(training.replays)
-    training.load_state_dict(loaded.state)
-    try:
-        for task, name in enumerate(training.suite.names):
-            if not training.is_warming_up(task):
-                yield {"run": run.name, "step": loaded.step, "task": name, **_compare(training, task)}
-    finally:
-        training.close()
+    with restored(run) as training:
+        for task, name in tasks_learned(training):
+            yield {"run": run.name, "step": training.steps, "task": name, **_compare(training, task)}
 
 
 def _compare(training: Training, task: int) -> dict[str, float]:
-    rng, device = np.random.default_rng(SEED), training.learner.device
-    replay, running, target = training.replays[task], training.learner.network.eval(), training.learner.target
-    seen = [torch.as_tensor(replay.sample(BATCH_SIZE, rng, Returns()).observations) for _ in range(2 * BATCHES)]
+    device = training.learner.device
+    running, target = training.learner.network.eval(), training.learner.target
+    seen = drawn(training, task, 2 * BATCHES, BATCH_SIZE, SEED)
     fresh, fresh_target = copy.deepcopy(running), copy.deepcopy(target)
     for network in (fresh, fresh_target):
         reestimate_statistics(network, task, (x.to(device) for x in seen[:BATCHES]), torch.Generator(device))
     valid = torch.from_numpy(training.suite.valid_actions_KA[task])
     networks = (running, fresh, target, fresh_target)
-    ours, theirs, targets, fresh_targets = (_q_values(net, seen[BATCHES:], task)[:, valid] for net in networks)
+    ours, theirs, targets, fresh_targets = (q_values(net, seen[BATCHES:], task)[:, valid] for net in networks)
     largest = torch.stack([ours.amax(1), theirs.amax(1)])
     return {
         "correlation": float(torch.corrcoef(largest)[0, 1]),
@@ -68,12 +55,6 @@ def _compare(training: Training, task: int) -> dict[str, float]:
         "target_fresh": float(fresh_targets.amax(1).mean()),
         **{f"off_{name}": value for name, value in _distances(running, fresh, task).items()},
     }
-
-
-@torch.no_grad()
-def _q_values(network: QNetwork, batches: list[Tensor], task: int) -> Tensor:
-    device = next(network.parameters()).device
-    return torch.cat([network(x.to(device), task).cpu() for x in batches])
 
 
 def _distances(running: QNetwork, fresh: QNetwork, task: int) -> dict[str, float]:

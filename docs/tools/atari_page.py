@@ -123,7 +123,7 @@ def atari_page() -> str:
         "each, and unfinished where the text says so: **first looks, not results.**",
     ]
     runs = sorted(path for path in FOLDER.iterdir() if path.is_dir())
-    lines += _pong(runs)
+    lines += [*_pong(runs), *_changed_actions()]
     for folder in runs:
         lines += _run(folder)
     lines += ["", *commands(runs, UNCHECKED)]
@@ -159,6 +159,38 @@ def _pong(runs: list[Path]) -> list[str]:
                 found = bins.setdefault(played // PONG_BIN_STEPS * PONG_BIN_STEPS, [])
                 found.append((int(row["length_steps"]), float(row["return"])))
         lines.append(_row([folder.name, str(len(games)), *(_length_and_return(bins.get(start)) for start in starts)]))
+    return lines
+
+
+def _changed_actions() -> list[str]:
+    """The table of ``benchmarks.changed_actions``, with the words around it."""
+    with (FOLDER / "changed_actions.csv").open(newline="") as stream:
+        found = list(csv.DictReader(stream))
+    changes = list(dict.fromkeys(row["change"] for row in found))
+    lines = [
+        "",
+        "## A small change of the weights changes many decisions",
+        "",
+        "Share of 512 observations from the replay whose greedy action is another one after a change: all products",
+        "rounded to bfloat16; noise on every weight, relative to the weights' root mean square in each tensor (mean of",
+        "three draws); so many rounds of the run's own updates of all games (`python -m benchmarks.changed_actions`).",
+        "BatchNorm's statistics were re-estimated after each change. A hundred times the noise changes some ten times",
+        "the actions, not a hundred: a spike is there or not. Actions of training are chosen in float32 since this was",
+        "measured; before, native runs in bfloat16 chose them in bfloat16.",
+        "",
+        _row(["run", "method", "game", *changes]),
+        _row(["---", "---", "---", *["---:"] * len(changes)]),
+    ]
+    for run, method, task in dict.fromkeys((row["run"], row["method"], row["task"]) for row in found):
+        cells = []
+        for change in changes:
+            shares = [
+                float(row["changed_actions"])
+                for row in found
+                if (row["run"], row["task"], row["change"]) == (run, task, change)
+            ]
+            cells.append(f"{100 * statistics.mean(shares):.1f} %")
+        lines.append(_row([run, method, task, *cells]))
     return lines
 
 

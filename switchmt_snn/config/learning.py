@@ -52,8 +52,8 @@ class LearningConfig:
     """What BatchNorm normalizes the next states by, in Q* and in the choice of Q: running statistics, which lag behind
     Q's weights, or those of the batch, as in the pass that is trained."""
     acting: Literal["auto", "eager", "native"] = "auto"
-    """Who computes the actions of training. eager: PyTorch in float32. native: the native engine, in the precision of
-    its updates. Evaluation is always eager. auto: native with engine native, else eager."""
+    """Who computes the actions of training, in float32 whatever learning.precision is: eager (PyTorch) or native (the
+    native engine). Evaluation is always eager. auto: native with engine native, else eager."""
     clip_rewards: bool | None = None
     """Clip every reward to [-1, 1] before targets are made; logs and scores always hold the raw reward. null takes the
     suite's choice: atari and minatar true, gym false."""

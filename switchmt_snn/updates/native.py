@@ -34,6 +34,10 @@ class Native(Engine):
         from switchmt_snn.native.network import NativeNetwork
 
         self._online, self._target = NativeNetwork(network, self.precision), NativeNetwork(target, self.precision)
+        acts, its_own = (target, self._target) if config.acting_network == "target" else (network, self._online)
+        # In float32, as evaluations and exports play it: rounded to bfloat16, a spiking network chooses another action
+        # in a fifth to a half of the states (results/atari).
+        self._acting = its_own if self.precision is None else NativeNetwork(acts, None)
 
     @classmethod
     def unavailable(cls, config: ExperimentConfig, device: torch.device, processes: int = 1) -> str | None:
@@ -92,7 +96,7 @@ class Native(Engine):
 
     def decisions(self, observations: Tensor, task: int, generator: torch.Generator) -> Tensor:
         """See ``Engine.decisions``."""
-        network = self._target if self.config.acting_network == "target" else self._online
+        network = self._acting
         return network.act(network.inputs(observations, generator), network.for_task(task))
 
     def optimizer(self) -> torch.optim.Optimizer:

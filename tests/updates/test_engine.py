@@ -7,7 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pytest
@@ -161,18 +161,23 @@ def test_native_equals_eager_to_rounding_for_every_task(network: dict[str, Any])
         ({"heads": "per_task", "threshold": 0.3}, 1),
     ],
 )
-def test_native_decisions_are_the_eager_ones_to_rounding(network: dict[str, Any], copies: int) -> None:
-    """Also after an update has changed the weights."""
+@pytest.mark.parametrize(("precision", "acts"), [("float32", "online"), ("bfloat16", "online"), ("bfloat16", "target")])
+def test_native_decisions_are_the_eager_ones_to_rounding(
+    network: dict[str, Any], copies: int, precision: str, acts: Literal["online", "target"]
+) -> None:
+    """Also after an update has changed the weights, and in float32 whatever the precision of the updates."""
     config = minatar(**{"threshold": 0.3, "stream_normalization": "batch", **network})
     side = SIDES[config.network.trunk]
-    learning = replace(config.learning, engine="native", acting="native", precision="float32")
+    learning = replace(
+        config.learning, engine="native", acting="native", precision=precision, acting_network=acts, loss="huber"
+    )
     images = ObservationSpec((4, side, side), 1, 1.0, True, 6, 3)
     learner = Learner(build_network(config.network, images, 1), learning, np.ones((3, 6), np.bool_), CPU, 0)
     rng = np.random.default_rng(copies)
     for _ in range(2):
         x = torch.from_numpy((rng.random((copies, *images.shape)) < 0.4).astype(np.uint8))
         with torch.inference_mode():
-            expected = learner.network.eval()(x, 1)
+            expected = learner.acting_network.eval()(x, 1)
             torch.testing.assert_close(
                 learner.engine.decisions(x, 1, learner.generator), expected, rtol=1e-3, atol=1e-4
             )
@@ -180,6 +185,7 @@ def test_native_decisions_are_the_eager_ones_to_rounding(network: dict[str, Any]
         many = [(rng.random((8, *images.shape)) < 0.4).astype(np.uint8) for _ in range(2)]
         ones = np.ones(8, np.float32)
         learner.update(Batch(many[0], rng.integers(0, 6, 8), ones, many[1], np.zeros(8, np.bool_), ones), 1)
+        learner.copy_target()
 
 
 def test_acting_by_an_engine_that_does_not_act_is_refused() -> None:
