@@ -42,6 +42,13 @@ target then chooses and values actions by chance, and the largest of some random
 `strong` has four settings against it: `double_q`, `reestimate_statistics_batches`, `next_statistics` and
 `acting_network`.
 """,
+    "low-rate-s1": """\
+`strong` with a quarter of its learning rate (2.5e-5) and seed 1, stored while it went on. **In Pong it scores as
+three-held-s3 did, and as deficit-s1 and held-enduro-s1, of the same seed and the whole rate, did not** (first table).
+Breakout comes as there; Enduro begins some 30,000 of its own steps later. One seed: whether it is the rate is to be
+seen with others, and rate-quarter-s1 shows no such difference in a network that does not score.
+`checkpoints/` holds the last weights.
+""",
     "pong-bfloat16-s1": """\
 pong-float32-s1 with updates and training's actions in bfloat16, stopped when the comparison was made. **Pong alone is
 learned in bfloat16, too**, as in pong-s1 (float32) and some 10,000 steps later than in pong-float32-s1; one seed each
