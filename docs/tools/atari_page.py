@@ -45,8 +45,8 @@ target then chooses and values actions by chance, and the largest of some random
     "low-rate-s1": """\
 `strong` with a quarter of its learning rate (2.5e-5) and seed 1, stored while it went on. **In Pong it scores as
 three-held-s3 did, and as deficit-s1 and held-enduro-s1, of the same seed and the whole rate, did not** (first table).
-Breakout comes as there; Enduro begins some 30,000 of its own steps later. One seed: whether it is the rate is to be
-seen with others, and rate-quarter-s1 shows no such difference in a network that does not score.
+Breakout and Enduro come as there. One seed: whether it is the rate is to be seen with others, and rate-quarter-s1 shows
+no such difference in a network that does not score.
 `checkpoints/` holds the last weights.
 """,
     "pong-bfloat16-s1": """\
