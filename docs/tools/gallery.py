@@ -80,7 +80,7 @@ PAGES = {
         {"report.png": (View(1280), 1300), "report_phone.png": (View(400, dark=True, scale=1.5), 1000)},
     ),
     "comparison": Page(
-        ("report", *MINATAR, "--out", "comparison"),
+        ("compare", *MINATAR, "--out", "comparison"),
         "comparison/comparison.html",
         {"comparison.png": (View(1280), 1200)},
     ),
