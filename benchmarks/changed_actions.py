@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import csv
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.restored import drawn, q_values, restored, tasks_learned
+from benchmarks.restored import drawn, q_values, restored, tasks_learned, write_rows
 from switchmt_snn.config.experiment import clips_rewards
 from switchmt_snn.learning.statistics import reestimate_statistics
 from switchmt_snn.learning.training import Training
@@ -105,13 +103,7 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folder with a checkpoint and its replay")
     parser.add_argument("--out", type=Path, metavar="FILE.csv", help="write here; the default is the terminal")
     arguments = parser.parse_args()
-    found = [row for run in arguments.runs for row in rows(run)]
-    with arguments.out.open("w", newline="") if arguments.out else sys.stdout as stream:
-        writer = csv.DictWriter(stream, list(found[0]))
-        writer.writeheader()
-        writer.writerows(
-            {key: f"{value:.4f}" if isinstance(value, float) else value for key, value in row.items()} for row in found
-        )
+    write_rows([row for run in arguments.runs for row in rows(run)], arguments.out)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import csv
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,3 +52,13 @@ def q_values(network: QNetwork, batches: list[Tensor], task: int, precision: tor
     """Q-values ``[B, A]`` of all batches, as the network stands, on the CPU."""
     device = next(network.parameters()).device
     return torch.cat([network(x.to(device), task, precision=precision).float().cpu() for x in batches])
+
+
+def write_rows(found: Sequence[dict[str, Any]], out: Path | None) -> None:
+    """Rows as CSV, numbers with four digits after the point; to the terminal if there is no file."""
+    with out.open("w", newline="") if out else sys.stdout as stream:
+        writer = csv.DictWriter(stream, list(found[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(
+            {key: f"{value:.4f}" if isinstance(value, float) else value for key, value in row.items()} for row in found
+        )

@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import argparse
 import copy
-import csv
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.restored import drawn, q_values, restored, tasks_learned
+from benchmarks.restored import drawn, q_values, restored, tasks_learned, write_rows
 from switchmt_snn.learning.statistics import reestimate_statistics
 from switchmt_snn.learning.training import Training
 from switchmt_snn.spiking.network import QNetwork
@@ -75,13 +73,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder with a checkpoint and its replay")
     parser.add_argument("--out", type=Path, metavar="FILE.csv", help="write here; the default is the terminal")
     arguments = parser.parse_args()
-    found = list(rows(arguments.run))
-    with arguments.out.open("w", newline="") if arguments.out else sys.stdout as stream:
-        writer = csv.DictWriter(stream, list(found[0]))
-        writer.writeheader()
-        writer.writerows(
-            {key: f"{value:.4f}" if isinstance(value, float) else value for key, value in row.items()} for row in found
-        )
+    write_rows(list(rows(arguments.run)), arguments.out)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 NAME = "switchmt-snn"
 _COMMAND = re.compile(
     rf"(?<![\w/.-]){NAME} "
-    r"(?=(?:train|evaluate|play|export|profile|report|study|replay-policies|runs|pack|describe|doctor|check-env)\b)"
+    r"(?=(?:train|evaluate|play|export|profile|report|compare|study|replay-policies|runs|pack|describe|doctor|check-env)\b)"
 )
 
 

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from switchmt_snn.acting.evaluation import Evaluation, EvaluationProtocol, TaskScore
 from switchmt_snn.cli import main
+from switchmt_snn.cli.entry import COMMANDS
 from switchmt_snn.cli.evaluate import EvaluateOptions
 from switchmt_snn.cli.export import ExportOptions
 from switchmt_snn.cli.parsing import for_another_suite, for_named_tasks, parse, split, split_one
@@ -121,6 +122,8 @@ def test_commands_in_messages_begin_as_the_program_was_called(tmp_path: Path, mo
     monkeypatch.setattr(sys, "argv", [str(script), "train"])
     monkeypatch.setenv("PATH", "/nowhere")
     assert names.runnable(text) == text.replace("run switchmt-snn train", f"run {script} train")
+    for command in COMMANDS:
+        assert names.runnable(f"switchmt-snn {command}") == f"{script} {command}"
     monkeypatch.setenv("PATH", str(tmp_path))
     assert names.runnable(text) == text
     monkeypatch.setattr(sys, "argv", ["/somewhere/switchmt_snn/__main__.py", "train"])

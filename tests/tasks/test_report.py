@@ -167,35 +167,32 @@ def test_what_training_would_refuse_is_refused() -> None:
     assert report_of("Combined", wrappers=("FlattenAction",)).actions == tuple(range(6))
 
 
-@pytest.mark.slow
-def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["check-env", f"{MODULE}:ChannelsFirst-v0", "--steps", "40"]
+def _called(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as done:
         main(words)
     assert done.value.code == 0
-    text = capsys.readouterr().out
+    return capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_command_prints_the_facts(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["check-env", f"{MODULE}:ChannelsFirst-v0", "--steps", "40"]
+    text = _called(words, capsys)
     assert "can be trained" in text
     assert "images, channels first: frames of 4 channels, 10 x 10" in text
     assert "0 to 2" in text
-    with pytest.raises(SystemExit):
-        main([*words, "--json"])
-    (facts,) = json.loads(capsys.readouterr().out)
+    (facts,) = json.loads(_called([*words, "--json"], capsys))
     assert facts["layout"] == "channels_first"
     assert facts["refused_network"] is None
 
 
 def test_the_command_says_that_no_network_fits(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["check-env", f"{MODULE}:TooWide-v0", "--steps", "2"]
-    with pytest.raises(SystemExit) as done:
-        main(words)
-    assert done.value.code == 0
-    text = capsys.readouterr().out
+    text = _called(words, capsys)
     assert "TooWide-v0 (gym): can be played, but train's own network does not fit" in text
     assert "note: network.hidden_units is 128, which makes a layer of 38,400,000 weights for 300,000 inputs" in text
     assert "lower it, or make the observations smaller" in text
-    with pytest.raises(SystemExit):
-        main([*words, "--json"])
-    (facts,) = json.loads(capsys.readouterr().out)
+    (facts,) = json.loads(_called([*words, "--json"], capsys))
     assert facts["refused_network"].startswith("network.hidden_units is 128")
 
 
